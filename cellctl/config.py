@@ -1,0 +1,252 @@
+"""What a person writes: one TOML file a cell. Unknown keys are errors; units are in the names.
+
+Poses that a person measured with a tape are `position_m` and `rpy_deg` (roll, pitch, yaw about
+the fixed x, y, z axes, REP-103). They only have to be right within `[tape]`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from cellctl.arms import arm
+from cellctl.errors import BadInput, CellctlError
+from cellctl.geometry import Transform
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+Pixels = tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Pose(Section):
+    """A tape-measured pose."""
+
+    position_m: Vector
+    rpy_deg: Vector
+
+    def transform(self, parent: str, child: str) -> Transform:
+        return Transform.from_rpy_deg(parent, child, self.rpy_deg, self.position_m)
+
+
+class CellSection(Section):
+    """`motion_enabled` replaces `cellctl enable`; only a simulated cell may set it."""
+
+    id: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")
+    data_dir: str = "~/.local/share/cellctl"
+    motion_enabled: bool = False
+
+
+class BusSection(Section):
+    listen: str = DEFAULT_ENDPOINT
+
+
+class SimulationSection(Section):
+    """The simulated world behind the `sim` drivers."""
+
+    preset: str
+    seed: int = Field(default=0, ge=0)
+    time: Literal["stepped", "paced"] = "stepped"
+    idle_exit_s: Positive = 1800.0
+
+
+class TapeSection(Section):
+    """How far the tape-measured poses may be off; the guard and the search allow for it."""
+
+    position_m: Positive = 0.10
+    angle_deg: Positive = 10.0
+
+
+class RobotSection(Section):
+    """Speeds at 100 %: caps of every motion, whatever a procedure asks for."""
+
+    driver: Literal["sim"]
+    arm: str
+    joint_speed_deg_s: Positive = 40.0
+    joint_acceleration_deg_s2: Positive = 80.0
+    tcp_speed_m_s: Positive = 0.5
+
+    @field_validator("arm")
+    @classmethod
+    def _known_arm(cls, value: str) -> str:
+        return arm(value).name
+
+
+class FactoryCamera(Section):
+    """The maker's intrinsics, in pixels; `distortion` in OpenCV's order k1 k2 p1 p2 k3."""
+
+    focal_px: tuple[Positive, Positive]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class CameraSection(Section):
+    driver: Literal["sim"]
+    image_size_px: Pixels
+    factory: FactoryCamera
+    pose: Pose
+
+
+class ProjectorSection(Section):
+    """`centre_px` is the principal point that throw and lens shift of the data sheet give; it
+    may lie outside the image. `latency_s` is display to glass, margin included."""
+
+    driver: Literal["sim"]
+    size_px: Pixels
+    throw_ratio: Positive
+    centre_px: tuple[float, float]
+    latency_s: float = Field(ge=0, lt=2)
+    pose: Pose
+
+
+class TableSection(Section):
+    """`pose`: centre of the lit area, z up. `touched_height_m`: the table's height in the world
+    frame as the robot knows it, from touching it. `area_m`: what is calibrated and drawn in."""
+
+    pose: Pose
+    touched_height_m: float
+    area_m: tuple[Positive, Positive]
+
+
+class BoardMount(Section):
+    """A board on the bracket. `board` is written as in a data set; `pose` is T_flange_board;
+    the hull is a box of `hull_m` (x, y, z) centred on the printed area."""
+
+    board: dict[str, Any]
+    pose: Pose
+    hull_m: tuple[Positive, Positive, Positive]
+
+
+class PenMount(Section):
+    """The pen on the flange: `tip_m` as far as known, and the radius of its hull."""
+
+    tip_m: Vector
+    radius_m: Positive
+
+
+class BracketSection(Section):
+    """Carries the boards and the pen, so that nothing is changed by hand."""
+
+    checkerboard: BoardMount
+    markers: BoardMount
+    pen: PenMount
+
+
+class Box(Section):
+    """An axis-parallel box in the world frame."""
+
+    name: str
+    min_m: Vector
+    max_m: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Box:
+        if not np.all(np.array(self.min_m) < np.array(self.max_m)):
+            raise ValueError(f"box {self.name!r}: min_m must be below max_m in x, y and z")
+        return self
+
+
+class WorkspaceSection(Section):
+    """Where the arm and all that it carries may be. `clearance_m` is kept from the table, the
+    keep-outs and between links; `device_radius_m` around camera and projector."""
+
+    box: Box
+    keep_outs: tuple[Box, ...] = ()
+    clearance_m: Positive = 0.03
+    device_radius_m: Positive = 0.12
+    joint_margin_deg: float = Field(default=5.0, ge=0, lt=90)
+
+
+class CellConfig(Section):
+    """One workcell."""
+
+    config_version: Literal[1]
+    cell: CellSection
+    bus: BusSection = BusSection()
+    simulation: SimulationSection | None = None
+    tape: TapeSection = TapeSection()
+    robot: RobotSection
+    camera: CameraSection
+    projector: ProjectorSection
+    table: TableSection
+    bracket: BracketSection
+    workspace: WorkspaceSection
+
+    @model_validator(mode="after")
+    def _only_simulations_are_enabled(self) -> CellConfig:
+        if self.simulation is None:
+            if self.cell.motion_enabled:
+                raise ValueError("cell.motion_enabled: only a cell with [simulation] may set it")
+            if "sim" in (self.robot.driver, self.camera.driver, self.projector.driver):
+                raise ValueError('driver "sim" needs a [simulation] section')
+        return self
+
+    def data_dir(self) -> Path:
+        """Where this cell keeps its runs; CELLCTL_DATA wins over the file."""
+        return Path(os.environ.get("CELLCTL_DATA") or self.cell.data_dir).expanduser()
+
+
+def load_config(path: Path) -> CellConfig:
+    """Read a cell's TOML. BadInput names file, key and, for an unknown key, the nearest one."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: cannot be read: {error}") from None
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadInput(f"{path}: not valid TOML: {error}") from None
+    return parse_config(document, str(path))
+
+
+def parse_config(document: dict[str, Any], where: str) -> CellConfig:
+    """As `load_config`, from a document already read; `where` is named in errors."""
+    try:
+        return CellConfig.model_validate(document)
+    except ValidationError as error:
+        lines = [_explain(item) for item in error.errors(include_url=False)]
+        raise BadInput(f"{where}: " + "; ".join(lines)) from None
+    except CellctlError as error:
+        raise BadInput(f"{where}: {error.message}") from None
+
+
+def _explain(item: Any) -> str:
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown key {key!r}{_nearest(item['loc'])}"
+    if item["type"] == "missing":
+        return f"missing key {key!r}"
+    return f"{key}: {item['msg']}" if key else str(item["msg"])
+
+
+def _nearest(location: tuple[Any, ...]) -> str:
+    known = _keys_at(location[:-1])
+    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; known here: {', '.join(known)}"
+
+
+def _keys_at(location: tuple[Any, ...]) -> list[str]:
+    model: Any = CellConfig
+    for part in location:
+        if isinstance(part, int):
+            continue
+        model = _model_in(model.model_fields[part].annotation)
+    return sorted(model.model_fields)
+
+
+def _model_in(annotation: Any) -> Any:
+    """The Section inside an annotation such as `Section | None` or `tuple[Section, ...]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(_model_in(part) for part in annotation.__args__ if part is not type(None))

@@ -1,0 +1,101 @@
+"""Every error that cellctl raises on purpose, with its wire code and its exit code.
+
+The message is written for a tired person: what is wrong, where, and what to do.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+
+class CellctlError(Exception):
+    """Base of all deliberate errors. `details` travels with the error over the bus."""
+
+    code: ClassVar[str] = "internal"
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, message: str, **details: Any) -> None:
+        super().__init__(message)
+        self.message = message
+        self.details = details
+
+
+class BadInput(CellctlError):
+    """A config, data set, message, image or option that cannot be used as it is."""
+
+    code = "bad_request"
+    exit_code = 2
+
+
+class Busy(CellctlError):
+    """Another run owns the cell."""
+
+    code = "busy"
+    exit_code = 3
+
+
+class NotEnabled(CellctlError):
+    """Motion was asked for without `cellctl enable`."""
+
+    code = "not_enabled"
+    exit_code = 4
+
+
+class Denied(CellctlError):
+    """The daemon lives but refuses this identity."""
+
+    code = "denied"
+    exit_code = 4
+
+
+class Unreachable(CellctlError):
+    """Nobody answers at the other end."""
+
+    code = "unreachable"
+    exit_code = 5
+
+
+class NotFound(CellctlError):
+    """No such run, procedure or calibration."""
+
+    code = "not_found"
+    exit_code = 6
+
+
+class DeviceFault(CellctlError):
+    """A device, its link or its worker failed. The run stops and can be resumed."""
+
+    code = "device_fault"
+
+
+class MotionRefused(CellctlError):
+    """The guard, or the controller, refuses a path. Nothing has moved."""
+
+    code = "motion_refused"
+
+
+class FrameError(CellctlError):
+    """Transforms were composed in an order that their frames do not allow."""
+
+
+class SolveError(CellctlError):
+    """The data do not determine the answer that was asked for."""
+
+    code = "solve_failed"
+
+
+BY_CODE: dict[str, type[CellctlError]] = {
+    kind.code: kind
+    for kind in (
+        CellctlError,
+        BadInput,
+        Busy,
+        NotEnabled,
+        Denied,
+        Unreachable,
+        NotFound,
+        DeviceFault,
+        MotionRefused,
+        SolveError,
+    )
+}

@@ -1,0 +1,184 @@
+"""What travels over the bus: versioned models. Readers ignore unknown fields of newer peers."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+RunStatus = Literal["running", "waiting", "interrupted", "done", "failed", "cancelled", "abandoned"]
+Verdict = Literal["pass", "fail"]
+Phase = Literal["idle", "running", "waiting", "stopping", "fault"]
+
+SCHEMA_PREFIX = "cellctl"
+
+
+class Message(BaseModel):
+    """Base of all messages; `v` is the version of the schema `cellctl.<Name>.v<N>`."""
+
+    model_config = ConfigDict(extra="ignore", ser_json_inf_nan="null")
+    VERSION: ClassVar[int] = 1
+    v: Literal[1] = 1
+
+    @classmethod
+    def schema_name(cls) -> str:
+        return f"{SCHEMA_PREFIX}.{cls.__name__}.v{cls.VERSION}"
+
+
+class Command(Message):
+    """A command; `client` is an audit label, not an identity."""
+
+    client: str = Field(default="?", max_length=64)
+
+
+class RunRequest(Command):
+    """`request_id` makes a trigger idempotent, also over a restart of the daemon.
+
+    `speed` is the percentage of the configured speed; `step` asks before every motion.
+    """
+
+    request_id: str = Field(min_length=8, max_length=64, pattern=r"^[A-Za-z0-9._-]+$")
+    params: dict[str, Any] = {}
+    speed: float = Field(default=100.0, gt=0.0, le=100.0)
+    step: bool = False
+
+
+class RunAccepted(Message):
+    run_id: str
+    boot: str
+    replayed: bool = False
+
+
+class ResumeRequest(Command):
+    run_id: str
+
+
+class CancelRequest(Command):
+    """Cancels the active run, or abandons an interrupted one. None means the active run."""
+
+    run_id: str | None = None
+
+
+class AckRequest(Command):
+    """Acknowledges a fault, or answers the operator question of a waiting run."""
+
+    answer: str = Field(default="ok", max_length=1000)
+
+
+class PromoteRequest(Command):
+    calibration_id: str
+
+
+class Accepted(Message):
+    """A command was accepted; `message` says what follows."""
+
+    message: str = ""
+    run_id: str | None = None
+
+
+class Error(Message):
+    """Sent through `reply_err`; `code` is one of `cellctl.errors.BY_CODE`."""
+
+    code: str
+    message: str
+    details: dict[str, Any] = {}
+
+
+class Question(Message):
+    """What a waiting run asks its operator."""
+
+    text: str
+    choices: list[str] = ["ok"]
+
+
+class Progress(Message):
+    run_id: str
+    step: str
+    done: int
+    total: int
+    text: str = ""
+
+
+class RobotSnapshot(Message):
+    """`joints` rad; `position` metres and `rvec` rad of the flange in the world frame."""
+
+    t: float
+    joints: list[float]
+    position: list[float]
+    rvec: list[float]
+    standstill_s: float
+
+
+class State(Message):
+    """An immutable snapshot of the daemon."""
+
+    cell: str
+    boot: str
+    seq: int
+    phase: Phase
+    active_run: str | None = None
+    procedure: str | None = None
+    question: Question | None = None
+    fault: str | None = None
+    progress: Progress | None = None
+    active_calibration: str | None = None
+    enabled_until: float | None = None
+    simulated: bool = False
+    wall_time: float
+
+
+class Event(Message):
+    """Something happened; `seq` grows by one within a `boot`."""
+
+    boot: str
+    seq: int
+    kind: str
+    wall_time: float
+    run_id: str | None = None
+    data: dict[str, Any] = {}
+
+
+class Events(Message):
+    boot: str
+    events: list[Event]
+
+
+class RunInfo(Message):
+    """A run as the store knows it."""
+
+    run_id: str
+    procedure: str
+    status: RunStatus
+    verdict: Verdict | None = None
+    reasons: list[str] = []
+    error: str | None = None
+    samples: int = 0
+    started: str
+    ended: str | None = None
+    params: dict[str, Any] = {}
+    progress: Progress | None = None
+    question: Question | None = None
+    calibration_id: str | None = None
+    directory: str = ""
+    result: dict[str, Any] | None = None
+
+
+class Runs(Message):
+    runs: list[RunInfo]
+
+
+class CalibrationInfo(Message):
+    calibration_id: str
+    active: bool
+    document: dict[str, Any]
+
+
+class ProcedureInfo(Message):
+    name: str
+    summary: str
+    moves: bool
+    params: dict[str, Any]
+
+
+class Procedures(Message):
+    procedures: list[ProcedureInfo]

@@ -1,0 +1,136 @@
+"""The fixed numbers of the simulated cells. A test pins them; nobody makes them kinder.
+
+Angles are in degrees and lengths in metres unless a name says otherwise. `*_sigma` is one
+standard deviation of a normal distribution, `*_off` a magnitude whose sign the seed draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """How the true arm differs from its reported kinematics, and how it repeats."""
+
+    zero_sigma_deg: float
+    length_sigma_m: float
+    twist_sigma_deg: float
+    repeat_sigma_m: float = 0.058e-3
+    repeat_sigma_deg: float = 0.02
+    drawing_repeat_sigma_deg: float = 0.01
+
+
+@dataclass(frozen=True)
+class CameraPreset:
+    """The true camera: `focal_px`, `centre_px` +- `pixel_sigma`, k1 and k2 +- 10 %."""
+
+    size_px: tuple[int, int]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    height_m: float
+    tilt_deg: tuple[float, float]
+    yaw_deg: float
+    factory_centre_off_px: float
+    pixel_sigma: float = 3.0
+    distortion: tuple[float, float, float, float, float] = (0.085, -0.060, 0.0005, -0.0004, 0.012)
+    radial_spread: float = 0.10
+    tilt_sigma_deg: float = 1.0
+    aim_sigma_m: float = 0.020
+    factory_focal_off: float = 0.003
+    factory_distortion_factor: float = 0.9
+    frame_rate_hz: float = 30.0
+    exposure_s: float = 0.0167
+    delivery_s: float = 0.060
+    buffers: int = 4
+    noise_sigma: float = 2.0
+    defocus_px: float = 0.7
+    unevenness: float = 0.30
+
+
+@dataclass(frozen=True)
+class ProjectorPreset:
+    """The true projector; its principal point lies below its image (lens shift)."""
+
+    throw_ratio: float
+    distance_m: float
+    yaw_deg: float
+    size_px: tuple[int, int] = (1920, 1080)
+    tilt_deg: tuple[float, float] = (3.0, 2.0)
+    tilt_sigma_deg: float = 1.0
+    centre_px: tuple[float, float] = (960.0, 1134.0)
+    centre_sigma_px: tuple[float, float] = (6.0, 8.0)
+    distortion: tuple[float, float] = (0.02, -0.004)
+    latency_s: float = 0.035
+    latency_sigma_s: float = 0.008
+
+
+@dataclass(frozen=True)
+class TablePreset:
+    """The table, and the area on it that is drawn in (x, y extents in the world frame)."""
+
+    centre_m: tuple[float, float, float]
+    area_m: tuple[float, float]
+    tilt_sigma_rad: float = 1.5e-3
+    bow_m: float = 1.0e-3
+    bow_off_centre: float = 0.15
+    touched_height_off_m: float = 0.3e-3
+
+
+@dataclass(frozen=True)
+class BoardPreset:
+    """Board sizes: inner corners and square of the checkerboard; markers, side and pitch."""
+
+    inner_corners: tuple[int, int]
+    square_m: float
+    markers: tuple[int, int]
+    marker_m: float
+    pitch_m: float
+    clearance_m: float
+    pen_m: float
+    scale_off: tuple[float, float] = (0.001, 0.005)
+    bend_m: float = 0.3e-3
+
+
+@dataclass(frozen=True)
+class Preset:
+    name: str
+    arm: str
+    arm_errors: ArmErrors
+    camera: CameraPreset
+    projector: ProjectorPreset
+    table: TablePreset
+    boards: BoardPreset
+    pen_sigma_m: float = 0.5e-3
+    pen_slip_sigma_m: float = 0.15e-3
+    tape_off_m: float = 0.10
+    tape_off_deg: float = 10.0
+
+
+CR = Preset(
+    name="cr",
+    arm="ur5",
+    arm_errors=ArmErrors(zero_sigma_deg=0.03, length_sigma_m=0.15e-3, twist_sigma_deg=0.01),
+    camera=CameraPreset(
+        size_px=(1920, 1080),
+        focal_px=(915.0, 914.0),
+        centre_px=(958.0, 548.0),
+        height_m=0.8,
+        tilt_deg=(4.0, -3.0),
+        yaw_deg=0.0,
+        factory_centre_off_px=2.0,
+    ),
+    projector=ProjectorPreset(throw_ratio=1.55, distance_m=1.3, yaw_deg=0.0),
+    table=TablePreset(centre_m=(0.0, -0.44, 0.0), area_m=(0.670, 0.375)),
+    boards=BoardPreset(
+        inner_corners=(9, 6),
+        square_m=0.030,
+        markers=(3, 4),
+        marker_m=0.050,
+        pitch_m=0.060,
+        clearance_m=0.09,
+        pen_m=0.15,
+    ),
+)
+
+PRESETS = {preset.name: preset for preset in (CR,)}
