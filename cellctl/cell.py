@@ -1,0 +1,31 @@
+"""The cell as a procedure sees it: guarded devices, the clock, the solver, what the config says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from cellctl.arms import ArmModel
+from cellctl.clock import Clock
+from cellctl.config import CellConfig
+from cellctl.drivers.base import Camera, Projector, Robot
+
+
+class Solver(Protocol):
+    """Runs pure functions outside the event loop's process."""
+
+    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float) -> Any: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """`robot` is the guarded one: every path that reaches a driver has passed `motion.Guard`."""
+
+    config: CellConfig
+    arm: ArmModel
+    robot: Robot
+    camera: Camera
+    projector: Projector
+    clock: Clock
+    solver: Solver
