@@ -119,13 +119,27 @@ class TableSection(Section):
     area_m: tuple[Positive, Positive]
 
 
+class Box(Section):
+    """A box along the axes of its frame."""
+
+    min_m: Vector
+    max_m: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Box:
+        if not np.all(np.array(self.min_m) < np.array(self.max_m)):
+            raise ValueError("min_m must be below max_m in x, y and z")
+        return self
+
+
 class BoardMount(Section):
-    """A board on the bracket. `board` is written as in a data set; `pose` is T_flange_board;
-    the hull is a box of `hull_m` (x, y, z) centred on the printed area."""
+    """A board on the bracket. `board` is written as in a data set; `pose` is T_flange_board, by
+    tape. The hull is a box in the flange frame that surely contains the board and its holder:
+    the guard trusts it, so it comes from the drawing or a ruler and is rounded up."""
 
     board: dict[str, Any]
     pose: Pose
-    hull_m: tuple[Positive, Positive, Positive]
+    hull: Box
 
 
 class PenMount(Section):
@@ -143,18 +157,8 @@ class BracketSection(Section):
     pen: PenMount
 
 
-class Box(Section):
-    """An axis-parallel box in the world frame."""
-
+class NamedBox(Box):
     name: str
-    min_m: Vector
-    max_m: Vector
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Box:
-        if not np.all(np.array(self.min_m) < np.array(self.max_m)):
-            raise ValueError(f"box {self.name!r}: min_m must be below max_m in x, y and z")
-        return self
 
 
 class WorkspaceSection(Section):
@@ -162,7 +166,7 @@ class WorkspaceSection(Section):
     keep-outs and between links; `device_radius_m` around camera and projector."""
 
     box: Box
-    keep_outs: tuple[Box, ...] = ()
+    keep_outs: tuple[NamedBox, ...] = ()
     clearance_m: Positive = 0.03
     device_radius_m: Positive = 0.12
     joint_margin_deg: float = Field(default=5.0, ge=0, lt=90)

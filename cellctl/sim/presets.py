@@ -79,7 +79,8 @@ class TablePreset:
 
 @dataclass(frozen=True)
 class BoardPreset:
-    """Board sizes: inner corners and square of the checkerboard; markers, side and pitch."""
+    """Board sizes: inner corners and square of the checkerboard; markers, side and pitch. The
+    bracket: boards `clearance_m` beside and `tray_m` before the flange, the pen's length."""
 
     inner_corners: tuple[int, int]
     square_m: float
@@ -87,6 +88,7 @@ class BoardPreset:
     marker_m: float
     pitch_m: float
     clearance_m: float
+    tray_m: float
     pen_m: float
     scale_off: tuple[float, float] = (0.001, 0.005)
     bend_m: float = 0.3e-3
@@ -129,7 +131,8 @@ CR = Preset(
         marker_m=0.050,
         pitch_m=0.060,
         clearance_m=0.09,
-        pen_m=0.15,
+        tray_m=0.08,
+        pen_m=0.18,
     ),
 )
 

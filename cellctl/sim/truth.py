@@ -235,8 +235,10 @@ def bracket(preset: BoardPreset) -> dict[str, tuple[Array, Array, Array]]:
     marker_size = (np.array(preset.markers) - 1) * preset.pitch_m + preset.marker_m
     marker_half = marker_size / 2 + (preset.pitch_m - preset.marker_m)
     markers = np.eye(4)
-    _centre_at(checker, checker_size / 2, (preset.clearance_m + checker_half[1], 0.0, 0.02))
-    _centre_at(markers, marker_size / 2, (-preset.clearance_m - marker_half[0], 0.0, 0.02))
+    _centre_at(
+        checker, checker_size / 2, (preset.clearance_m + checker_half[1], 0.0, preset.tray_m)
+    )
+    _centre_at(markers, marker_size / 2, (-preset.clearance_m - marker_half[0], 0.0, preset.tray_m))
     return {
         "checkerboard": (checker, checker_size / 2, checker_half),
         "markers": (markers, marker_size / 2, marker_half),

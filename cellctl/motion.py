@@ -1,0 +1,290 @@
+"""The guard: every path of every procedure passes it, whole, before anything moves.
+
+It checks the arm's links, boards and pen, as spheres (`cellctl.hulls`), along the straight joint
+lines from the measured joints, against the workspace box, keep-outs, the table, camera and
+projector, the arm itself and the joint limits. It is not a safety function: it knows what the
+config says, and a person's arm is not in the config.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cellctl.arms import JOINTS, ArmModel, arm
+from cellctl.config import Box, CellConfig
+from cellctl.drivers.base import Identity, Path, Robot, RobotState, Target
+from cellctl.errors import MotionRefused
+from cellctl.geometry import Array, Mask
+from cellctl.hulls import Body, box_body, link_bodies, pen_body
+
+FIRST_FREE_FRAME = 2
+"""Links before this one stand where the arm is bolted down: table and workspace box do not bind
+them. This one, the upper arm, starts there: it keeps its hull clear, but no clearance more."""
+LAST_ARM_FRAME = 4
+"""Shoulder, arm and first wrist link are checked against each other from two frames apart; the
+base, and what the wrist carries, from three apart: nearer ones are joined and always near."""
+MAX_STEP_M = 0.01
+"""No sphere moves further than this between two checked states of a path."""
+STANDSTILL_S = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Keepout:
+    """A box (`low`, `high`) in the world, each (3,), that no sphere may touch."""
+
+    name: str
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stands around the arm, in the world frame, metres. `balls`: (name, centre, radius)."""
+
+    box_low: Array
+    box_high: Array
+    table_height: float
+    keepouts: tuple[Keepout, ...]
+    balls: tuple[tuple[str, Array, float], ...]
+
+
+@dataclass(frozen=True)
+class Violation:
+    """Which of the checked states is refused first, and why in words."""
+
+    index: int
+    reason: str
+
+
+Checks = list[tuple[str, Mask]]
+"""Rules in words, and which of the checked states (n,) each of them refuses."""
+
+
+class Guard:
+    """Decides about joint vectors and paths; pure, moves nothing."""
+
+    def __init__(
+        self,
+        model: ArmModel,
+        bodies: tuple[Body, ...],
+        scene: Scene,
+        clearance_m: float,
+        joint_margin_rad: float,
+    ) -> None:
+        self.arm, self.bodies, self.scene = model, bodies, scene
+        self.clearance, self.joint_margin = clearance_m, joint_margin_rad
+        self._free_bodies = [body for body in bodies if body.frame >= FIRST_FREE_FRAME]
+        self._pairs = _pairs(bodies)
+
+    def free(self, joints: Array) -> Mask:
+        """Whether each of joints (n, 6) is allowed."""
+        return np.logical_and.reduce([~hit for _, hit in self._checks(joints)])
+
+    def first_violation(self, joints: Array) -> Violation | None:
+        """The first of joints (n, 6) that is refused."""
+        first: Violation | None = None
+        for reason, hit in self._checks(joints):
+            index = int(np.argmax(hit))
+            if hit[index] and (first is None or index < first.index):
+                first = Violation(index, reason)
+        return first
+
+    def check(self, start: Array, path: Path) -> None:
+        """MotionRefused unless the whole path from the joints `start` (6,) is allowed."""
+        waypoints = np.asarray(path.waypoints, dtype=float)
+        if waypoints.ndim != 2 or waypoints.shape[1] != JOINTS or not np.isfinite(waypoints).all():
+            raise MotionRefused(
+                f"a path is (n, {JOINTS}) finite joint angles, not {waypoints.shape}"
+            )
+        joints = self.sample(start, path)
+        violation = self.first_violation(joints)
+        if violation is None:
+            return
+        if violation.index == 0:
+            raise MotionRefused(
+                f"the arm stands where it must not: {violation.reason}; jog it clear by hand"
+            )
+        share = violation.index / (len(joints) - 1)
+        degrees = ", ".join(f"{v:.1f}" for v in np.degrees(joints[violation.index]))
+        raise MotionRefused(
+            f"path refused at {share:.0%} of its way: {violation.reason} (joints {degrees} deg)"
+        )
+
+    def allows(self, start: Array, path: Path) -> bool:
+        """Whether `check` would pass."""
+        return bool(self.free(self.sample(start, path)).all())
+
+    def sample(self, start: Array, path: Path) -> Array:
+        """Joints (n, 6) along a path, so close that no sphere moves more than MAX_STEP_M."""
+        corners = np.vstack([start, path.waypoints])
+        pieces = [corners[:1]]
+        for a, b in itertools.pairwise(corners):
+            count = max(int(np.ceil(self._travel(a, b) / MAX_STEP_M)), 1)
+            pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
+        return np.vstack(pieces)
+
+    def tip_speed(self, start: Array, path: Path, joint_speed: float) -> float:
+        """The fastest that any sphere moves, m/s, when the leading joint runs at `joint_speed`."""
+        corners = np.vstack([start, path.waypoints])
+        fastest = 0.0
+        for a, b in itertools.pairwise(corners):
+            duration = np.abs(b - a).max() / joint_speed
+            if duration > 0:
+                fastest = max(fastest, self._travel(a, b) / duration)
+        return fastest
+
+    def spheres(self, joints: Array, bodies: list[Body] | None = None) -> tuple[Array, Array]:
+        """Centres (n, m, 3) and radii (m,) of `bodies` (all that may move freely) for (n, 6)."""
+        chosen = self._free_bodies if bodies is None else bodies
+        frames = self.arm.link_frames(np.atleast_2d(joints))
+        centres = np.concatenate([body.world(frames) for body in chosen], axis=1)
+        return centres, np.concatenate([body.radii for body in chosen])
+
+    def _travel(self, a: Array, b: Array) -> float:
+        """Upper estimate of how far any sphere travels on the joint line a-b: its longest chord
+        polyline over nine states."""
+        joints = a + (b - a) * np.linspace(0.0, 1.0, 9)[:, None]
+        centres, _ = self.spheres(joints)
+        lengths = np.linalg.norm(np.diff(centres, axis=0), axis=2).sum(axis=0)
+        return float(lengths.max())
+
+    def _checks(self, joints: Array) -> Checks:
+        """(reason, hit (n,)) of every rule for joints (n, 6)."""
+        joints = np.atleast_2d(joints)
+        frames = self.arm.link_frames(joints)
+        inside = self.arm.within_limits(joints, self.joint_margin)
+        checks: Checks = [("a joint is at its limit", ~inside)]
+        for body in self._free_bodies:
+            checks += self._surroundings(body, body.world(frames))
+        for one, other in self._pairs:
+            gap = _gap(one.world(frames), one.radii, other.world(frames), other.radii)
+            checks.append((f"{one.name} and {other.name} meet", gap < 0.0))
+        return checks
+
+    def _surroundings(self, body: Body, centres: Array) -> Checks:
+        scene = self.scene
+        reach = body.radii + (self.clearance if body.frame > FIRST_FREE_FRAME else 0.0)
+        over = (centres - reach[:, None] < scene.box_low) | (
+            centres + reach[:, None] > scene.box_high
+        )
+        low = centres[..., 2] - reach < scene.table_height
+        checks: Checks = [
+            (f"{body.name} leaves the workspace box", over.any(axis=(1, 2))),
+            (f"{body.name} comes too near to the table", low.any(axis=1)),
+        ]
+        for keepout in scene.keepouts:
+            away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
+            hit = np.linalg.norm(away, axis=-1) < reach
+            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit.any(axis=1)))
+        for name, centre, radius in scene.balls:
+            near = np.linalg.norm(centres - centre, axis=-1) < reach + radius
+            checks.append((f"{body.name} comes too near to the {name}", near.any(axis=1)))
+        return checks
+
+
+def _pairs(bodies: tuple[Body, ...]) -> list[tuple[Body, Body]]:
+    return [
+        (one, other)
+        for i, one in enumerate(bodies)
+        for other in bodies[i + 1 :]
+        if _can_meet(one.frame, other.frame)
+    ]
+
+
+def _can_meet(one: int, other: int) -> bool:
+    inner = min(one, other) >= 1 and max(one, other) <= LAST_ARM_FRAME
+    return abs(one - other) >= (2 if inner else 3)
+
+
+def _gap(a: Array, a_radii: Array, b: Array, b_radii: Array) -> Array:
+    """Smallest distance (n,) between two sets of spheres (n, k, 3) and (n, m, 3)."""
+    distance = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1)
+    return (distance - a_radii[:, None] - b_radii).min(axis=(1, 2))
+
+
+def guard_of(config: CellConfig) -> Guard:
+    """The guard of a configured cell. Camera and projector are balls around their tape-measured
+    places, larger by what the tape may be off."""
+    model = arm(config.robot.arm)
+    bracket, space = config.bracket, config.workspace
+    bodies = (
+        *link_bodies(model),
+        _hull("checkerboard", bracket.checkerboard.hull),
+        _hull("marker board", bracket.markers.hull),
+        pen_body(bracket.pen.tip_m, bracket.pen.radius_m),
+    )
+    radius = space.device_radius_m + config.tape.position_m
+    scene = Scene(
+        box_low=np.array(space.box.min_m),
+        box_high=np.array(space.box.max_m),
+        table_height=config.table.touched_height_m,
+        keepouts=tuple(
+            Keepout(box.name, np.array(box.min_m), np.array(box.max_m)) for box in space.keep_outs
+        ),
+        balls=(
+            ("camera", np.array(config.camera.pose.position_m), radius),
+            ("projector", np.array(config.projector.pose.position_m), radius),
+        ),
+    )
+    return Guard(model, bodies, scene, space.clearance_m, float(np.radians(space.joint_margin_deg)))
+
+
+def _hull(name: str, hull: Box) -> Body:
+    low, high = np.array(hull.min_m), np.array(hull.max_m)
+    return box_body(name, JOINTS, (low + high) / 2, high - low)
+
+
+class GuardedRobot:
+    """A Robot whose every motion is allowed by a person and by the guard, and capped in speed.
+
+    `permission()` raises NotEnabled when motion is not allowed now; `speed` is the fraction of
+    the configured speed that the present run may use.
+    """
+
+    def __init__(
+        self, robot: Robot, guard: Guard, config: CellConfig, permission: Callable[[], None]
+    ) -> None:
+        self._robot, self.guard, self._permission = robot, guard, permission
+        self._joint_speed = float(np.radians(config.robot.joint_speed_deg_s))
+        self._tcp_speed = config.robot.tcp_speed_m_s
+        self.speed = 1.0
+
+    async def identity(self) -> Identity:
+        return await self._robot.identity()
+
+    async def read(self) -> RobotState:
+        return await self._robot.read()
+
+    async def state_at(self, t: float) -> RobotState:
+        return await self._robot.state_at(t)
+
+    async def check(self, path: Path) -> None:
+        """MotionRefused by the guard, from the measured joints, or by the controller."""
+        state = await self._robot.read()
+        self.guard.check(state.joints, path)
+        await self._robot.check(path)
+
+    async def move(self, target: Target, *, timeout_s: float) -> RobotState:
+        """Guarded and capped; NotEnabled or MotionRefused before anything has moved."""
+        self._permission()
+        if not 0.0 < target.speed <= 1.0:
+            raise MotionRefused(f"speed fraction {target.speed} is not in (0, 1]")
+        state = await self._robot.read()
+        if state.standstill_s < STANDSTILL_S:
+            raise MotionRefused("the arm is still moving; a path starts at standstill")
+        self.guard.check(state.joints, target.path)
+        await self._robot.check(target.path)
+        speed = self._capped(state.joints, target)
+        return await self._robot.move(Target(target.path, speed), timeout_s=timeout_s)
+
+    async def stop(self, *, clean: bool) -> None:
+        await self._robot.stop(clean=clean)
+
+    def _capped(self, start: Array, target: Target) -> float:
+        tip = self.guard.tip_speed(start, target.path, self._joint_speed)
+        cap = 1.0 if tip <= self._tcp_speed else self._tcp_speed / tip
+        return min(target.speed * self.speed, cap)
