@@ -29,6 +29,7 @@ LAST_ARM_FRAME = 4
 base, and what the wrist carries, from three apart: nearer ones are joined and always near."""
 MAX_STEP_M = 0.01
 """No sphere moves further than this between two checked states of a path."""
+COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
 STANDSTILL_S = 0.05
@@ -117,8 +118,9 @@ class Guard:
         )
 
     def allows(self, start: Array, path: Path) -> bool:
-        """Whether `check` would pass."""
-        return bool(self.free(self.sample(start, path)).all())
+        """Whether `check` would pass. Looks at a few states first: most refusals show there."""
+        joints = self.sample(start, path)
+        return bool(self.free(joints[::COARSE]).all() and self.free(joints).all())
 
     def sample(self, start: Array, path: Path) -> Array:
         """Joints (n, 6) along a path, so close that no sphere moves more than MAX_STEP_M."""
@@ -159,11 +161,14 @@ class Guard:
         frames = self.arm.link_frames(joints)
         inside = self.arm.within_limits(joints, self.joint_margin)
         checks: Checks = [("a joint is at its limit", ~inside)]
-        for body in self._free_bodies:
-            checks += self._surroundings(body, body.world(frames))
-        for one, other in self._pairs:
-            gap = _gap(one.world(frames), one.radii, other.world(frames), other.radii)
-            checks.append((f"{one.name} and {other.name} meet", gap < 0.0))
+        centres = [body.world(frames) for body in self.bodies]
+        for body, spheres in zip(self.bodies, centres, strict=True):
+            if body.frame >= FIRST_FREE_FRAME:
+                checks += self._surroundings(body, spheres)
+        for i, j in self._pairs:
+            one, other = self.bodies[i], self.bodies[j]
+            meet = _meet(centres[i], one.radii, centres[j], other.radii)
+            checks.append((f"{one.name} and {other.name} meet", meet))
         return checks
 
     def _surroundings(self, body: Body, centres: Array) -> Checks:
@@ -177,20 +182,20 @@ class Guard:
         ]
         for keepout in scene.keepouts:
             away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
-            hit = np.linalg.norm(away, axis=-1) < reach
-            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit.any(axis=1)))
+            hit = (np.linalg.norm(away, axis=-1) - reach).min(axis=1) < 0.0
+            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit))
         for name, centre, radius in scene.balls:
-            near = np.linalg.norm(centres - centre, axis=-1) < reach + radius
-            checks.append((f"{body.name} comes too near to the {name}", near.any(axis=1)))
+            near = np.linalg.norm(centres - centre, axis=-1) - reach - radius
+            checks.append((f"{body.name} comes too near to the {name}", near.min(axis=1) < 0.0))
         return checks
 
 
-def _pairs(bodies: tuple[Body, ...]) -> list[tuple[Body, Body]]:
+def _pairs(bodies: tuple[Body, ...]) -> list[tuple[int, int]]:
     return [
-        (one, other)
+        (i, j)
         for i, one in enumerate(bodies)
-        for other in bodies[i + 1 :]
-        if _can_meet(one.frame, other.frame)
+        for j, other in enumerate(bodies)
+        if i < j and _can_meet(one.frame, other.frame)
     ]
 
 
@@ -199,10 +204,10 @@ def _can_meet(one: int, other: int) -> bool:
     return abs(one - other) >= (2 if inner else 3)
 
 
-def _gap(a: Array, a_radii: Array, b: Array, b_radii: Array) -> Array:
-    """Smallest distance (n,) between two sets of spheres (n, k, 3) and (n, m, 3)."""
-    distance = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1)
-    return (distance - a_radii[:, None] - b_radii).min(axis=(1, 2))
+def _meet(a: Array, a_radii: Array, b: Array, b_radii: Array) -> Mask:
+    """Whether any sphere of (n, k, 3) touches any of (n, m, 3)."""
+    squares = (a**2).sum(-1)[:, :, None] + (b**2).sum(-1)[:, None] - 2 * a @ np.swapaxes(b, 1, 2)
+    return (squares - (a_radii[:, None] + b_radii) ** 2).min(axis=(1, 2)) < 0.0
 
 
 def guard_of(config: CellConfig) -> Guard:

@@ -64,7 +64,7 @@ def test_real_cell_cannot_use_the_simulated_drivers():
 
 
 def test_missing_and_broken_files_are_named(tmp_path):
-    with pytest.raises(BadInput, match="nowhere.toml: cannot be read"):
+    with pytest.raises(BadInput, match=r"nowhere\.toml: cannot be read"):
         load_config(tmp_path / "nowhere.toml")
     broken = tmp_path / "broken.toml"
     broken.write_text("[cell\n")

@@ -7,34 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cellctl import ik
 from cellctl.config import parse_config
 from cellctl.drivers.base import Path
 from cellctl.errors import MotionRefused
-from cellctl.geometry import pose_matrix
 from cellctl.hulls import box_body, capsule_body, link_bodies
 from cellctl.motion import MAX_STEP_M, guard_of
-from cellctl.procedures import routing
 from tests import cells
-
-ABOVE = np.radians([-90.0, -110.0, 110.0, -90.0, -90.0, 90.0])
-"""The flange points down, high over the near edge of the table."""
-
-
-def pen_at(guard, x, y, z, near=ABOVE):
-    """Joints (n, 6) with the pen straight down at (x, y, z), turned in eight ways."""
-    turns = [pose_matrix((0, 0, yaw), (x, y, z + 0.18)) for yaw in np.arange(8) * np.pi / 4]
-    poses = np.array(turns) @ pose_matrix((np.pi, 0, 0), (0, 0, 0))
-    starts = np.vstack([near, ik.random_starts(guard.arm, 20, seed=5)])
-    return np.concatenate(ik.solutions(guard.arm, poses, near, starts))
-
-
-def free_pen_at(guard, x, y, z, near=ABOVE):
-    """The allowed one of them that is nearest to `near`."""
-    joints = pen_at(guard, x, y, z, near)
-    joints = joints[guard.free(joints)]
-    assert len(joints), f"the test needs a free posture at ({x}, {y}, {z})"
-    return joints[np.argmin(np.abs(joints - near).max(axis=1))]
+from tests.postures import free_pen_at, pen_at
 
 
 def refused(guard, start, *waypoints):
@@ -143,29 +122,3 @@ def test_hulls_cover_their_shapes(guard):
 def covered(body, points):
     distance = np.linalg.norm(points[:, None] - body.points, axis=2)
     return (distance <= body.radii + 1e-12).any(axis=1)
-
-
-def test_routes_around_a_keep_out():
-    document = cells.document()
-    document["workspace"]["keep_outs"] = [
-        {"name": "post", "min_m": [-0.03, -0.48, 0.0], "max_m": [0.03, -0.42, 0.2]}
-    ]
-    guard = guard_of(parse_config(document, "test"))
-    left = free_pen_at(guard, -0.3, -0.4, 0.15)
-    right = free_pen_at(guard, 0.3, -0.4, 0.15, left)
-    assert not guard.allows(left, Path(right[None]))
-    path = routing.connect(guard, left, right)
-    assert path is not None
-    assert np.array_equal(path.waypoints[-1], right)
-    guard.check(left, path)
-
-
-def test_nearest_first_visits_all_that_can_be_reached(guard, start):
-    goals = start + np.random.default_rng(2).uniform(-0.15, 0.15, (6, 6))
-    route = routing.nearest_first(guard, start, goals)
-    free = {i for i in range(6) if guard.free(goals[i][None])[0]}
-    assert {i for i, _ in route} <= free
-    here = start
-    for i, path in route:
-        guard.check(here, path)
-        here = goals[i]
