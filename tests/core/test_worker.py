@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +15,7 @@ from cellctl import worker
 from cellctl.errors import DeviceFault, SolveError
 from cellctl.worker import CallFailed, Child
 from tests.core import functions
+from tests.core.processes import alive, python, said
 
 
 @pytest.fixture
@@ -31,14 +29,6 @@ async def until(condition, seconds=5.0):
     while not condition():
         assert time.monotonic() < deadline, "it did not come true"
         await asyncio.sleep(0.01)
-
-
-def alive(pid):
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
 
 
 async def test_one_process_serves_many_calls(child):
@@ -193,7 +183,7 @@ async def test_close_ends_a_call_in_flight_and_is_idempotent(tmp_path):
 
 async def test_a_child_that_cannot_start_says_why():
     async with Child("solver", preload=["no_such_module"]) as child:
-        with pytest.raises(DeviceFault, match="exited with code 1 during its start.*no_such_modul"):
+        with pytest.raises(DeviceFault, match=r"exited with code 1 during its start.*no_such_m"):
             await child.call(functions.pid, timeout_s=20)
 
 
@@ -226,11 +216,8 @@ asyncio.run(main())
 
 @pytest.mark.parametrize("call", [("sleep", "(60,)"), ("hold_the_lock", "()")])
 def test_it_ends_with_a_parent_that_is_killed(call):
-    command = [sys.executable, "-c", PARENT, *call]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as parent:
-        assert parent.stdout is not None
-        pid = int(parent.stdout.readline())
+    with python("-c", PARENT, *call) as parent:
+        pid = int(said(parent))
         time.sleep(0.2)
         assert alive(pid)
         parent.kill()
