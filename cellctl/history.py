@@ -127,36 +127,42 @@ class Sample:
 
 
 class History:
-    """The entries of one run, to be asked. `entries` may still grow."""
+    """The events of one run, to be asked. More may be added, by one thread."""
 
     def __init__(self, directory: Path, entries: Sequence[Entry]) -> None:
         self._directory = directory
-        self._entries = entries
+        self._samples: dict[tuple[str, str], dict[str, Sample]] = {}
+        self._records: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        self._result: dict[str, Any] | None = None
+        for entry in entries:
+            self.add(entry)
+
+    def add(self, entry: Entry) -> None:
+        """Take in one more event."""
+        data = entry.data
+        if entry.kind == "sample":
+            step = self._samples.setdefault((data["scope"], data["step"]), {})
+            step[data["key"]] = self._sample(data)
+        elif entry.kind == "record":
+            self._records.setdefault((data["scope"], data["name"]), []).append(data["data"])
+        elif entry.kind == "result":
+            self._result = data
 
     def samples(self, scope: str, step: str) -> dict[str, Sample]:
         """The samples of one step by their keys, in the order in which they were taken."""
-        return {
-            entry.data["key"]: self._sample(entry)
-            for entry in self._of("sample", scope)
-            if entry.data["step"] == step
-        }
-
-    def _sample(self, entry: Entry) -> Sample:
-        images = {
-            name: Picture(self._directory / named["file"], named["sha256"])
-            for name, named in entry.data["images"].items()
-        }
-        return Sample(entry.data["key"], entry.data["data"], images)
+        return dict(self._samples.get((scope, step), {}))
 
     def records(self, scope: str, name: str) -> list[dict[str, Any]]:
         """What was recorded as `name`, oldest first."""
-        found = self._of("record", scope)
-        return [entry.data["data"] for entry in found if entry.data["name"] == name]
+        return list(self._records.get((scope, name), []))
 
     def result(self) -> dict[str, Any] | None:
         """The result that the procedure came to, if it did."""
-        found = [entry.data for entry in self._entries if entry.kind == "result"]
-        return found[-1] if found else None
+        return self._result
 
-    def _of(self, kind: str, scope: str) -> list[Entry]:
-        return [e for e in self._entries if e.kind == kind and e.data["scope"] == scope]
+    def _sample(self, data: dict[str, Any]) -> Sample:
+        images = {
+            name: Picture(self._directory / named["file"], named["sha256"])
+            for name, named in data["images"].items()
+        }
+        return Sample(data["key"], data["data"], images)

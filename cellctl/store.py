@@ -63,7 +63,6 @@ class RunRecord:
         self.folder = folder
         self.history = History(folder.directory, entries)
         self._journal = journal
-        self._entries = entries
         self._in_order = in_order
 
     @property
@@ -98,7 +97,7 @@ class RunRecord:
 
     def _append(self, kind: str, data: dict[str, Any]) -> Entry:
         entry = self._journal.append(kind, data)
-        self._entries.append(entry)
+        self.history.add(entry)
         self.folder.standing = advance(self.folder.standing, entry)
         return entry
 

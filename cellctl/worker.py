@@ -119,11 +119,8 @@ class Child:
         return self._process
 
     async def _launch(self) -> _Process:
-        loop = asyncio.get_running_loop()
         started = time.monotonic()
-        self._process = process = await loop.run_in_executor(
-            self._thread, _Process, self._name, self._preload
-        )
+        self._process = process = await self._spawn()
         await self._within(START_S, process, process.wait_ready, what="its start")
         log.info(
             "child process is ready",
@@ -132,6 +129,19 @@ class Child:
             seconds=round(time.monotonic() - started, 3),
         )
         return process
+
+    async def _spawn(self) -> _Process:
+        """Start a process, which takes milliseconds; it is not lost when that is cancelled."""
+        loop = asyncio.get_running_loop()
+        future = loop.run_in_executor(self._thread, _Process, self._name, self._preload)
+        try:
+            await _finish(future)
+        except asyncio.CancelledError:
+            if future.exception() is None:
+                self._process = future.result()
+                await self._discard()
+            raise
+        return future.result()
 
     async def _within(
         self,

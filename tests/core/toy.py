@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import hashlib
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from cellctl.active_run import Limits
+from cellctl.bulletin import Published
 from cellctl.cell import Cell, Solver
 from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
@@ -27,6 +28,17 @@ from cellctl.drivers.base import Path as Joints
 from cellctl.engine import Engine
 from cellctl.errors import BadInput, DeviceFault, MotionRefused
 from cellctl.geometry import Transform
+from cellctl.journal import Entry, read
+from cellctl.messages import (
+    Accepted,
+    AckRequest,
+    CancelRequest,
+    ResumeRequest,
+    RunAccepted,
+    RunInfo,
+    RunRequest,
+    State,
+)
 from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
@@ -294,7 +306,42 @@ class Bench:
     engine: Engine
     robot: ToyRobot
     solver: Solver
-    seen: list[Any] = field(default_factory=list)
+    seen: list[Published] = field(default_factory=list)
+
+    async def start(self, procedure: str, request_id: str = "request-1", **params: Any) -> str:
+        """Start a run and return its id."""
+        request = RunRequest(request_id=request_id, client="test", params=params)
+        return (await self.engine.start(procedure, request)).run_id
+
+    async def resume(self, run_id: str) -> RunAccepted:
+        return await self.engine.resume(ResumeRequest(run_id=run_id, client="test"))
+
+    async def cancel(self, run_id: str | None = None) -> Accepted:
+        return await self.engine.cancel(CancelRequest(run_id=run_id, client="test"))
+
+    async def ack(self, answer: str = "ok", question: int | None = None) -> Accepted:
+        return await self.engine.ack(AckRequest(answer=answer, question=question, client="test"))
+
+    async def phase(self, *phases: str) -> State:
+        """Wait until the engine is in one of these phases."""
+        await self.until(lambda: self.engine.state().phase in phases)
+        return self.engine.state()
+
+    async def ended(self, run_id: str) -> RunInfo:
+        """Wait for a run's end."""
+        await self.phase("idle", "fault")
+        return await self.engine.run_info(run_id)
+
+    async def until(self, condition: Callable[[], Any]) -> None:
+        async with asyncio.timeout(20):
+            while not condition():  # noqa: ASYNC110 - conditions of all kinds, in tests
+                await asyncio.sleep(0.002)
+
+    def events(self) -> list[str]:
+        return [event.kind for event in self.engine.events().events]
+
+    def journal(self, run_id: str) -> list[Entry]:
+        return read(self.directory / "runs" / run_id / "journal.jsonl").intact()
 
 
 @contextlib.asynccontextmanager
