@@ -12,10 +12,11 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def python(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A process that runs `python ARGUMENTS`, its stdout piped; killed at the end."""
+    """A process that runs `python ARGUMENTS`, stdin and stdout piped; killed at the end."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
         try:
             yield process
         finally:
