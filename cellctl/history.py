@@ -17,7 +17,7 @@ LIVE: frozenset[RunStatus] = frozenset({"running", "waiting"})
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a run stands after its newest event. `counts` are samples by step."""
+    """Where a run stands after its newest event. `counts` are samples by `<scope>/<step>`."""
 
     status: RunStatus = "running"
     verdict: Verdict | None = None
@@ -46,16 +46,12 @@ def _question(standing: Standing, entry: Entry) -> Standing:
 
 
 def _step(standing: Standing, entry: Entry) -> Standing:
-    return replace(standing, step=_step_of(entry), step_total=entry.data["total"])
+    return replace(standing, step=entry.at, step_total=entry.data["total"])
 
 
 def _sample(standing: Standing, entry: Entry) -> Standing:
-    step = _step_of(entry)
-    return replace(standing, counts={**standing.counts, step: standing.counts.get(step, 0) + 1})
-
-
-def _step_of(entry: Entry) -> str:
-    return address(entry.data["scope"], entry.data["step"])
+    counts = {**standing.counts, entry.at: standing.counts.get(entry.at, 0) + 1}
+    return replace(standing, counts=counts)
 
 
 def _end(status: RunStatus) -> Callable[[Standing, Entry], Standing]:
@@ -65,7 +61,7 @@ def _end(status: RunStatus) -> Callable[[Standing, Entry], Standing]:
             standing,
             status=status,
             error=data.get("error"),
-            fault=data.get("fault"),
+            fault=data.get("fault") or standing.fault,
             ended=entry.time,
             question=None,
             verdict=data.get("verdict"),
@@ -131,7 +127,7 @@ class History:
 
     def __init__(self, directory: Path, entries: Sequence[Entry]) -> None:
         self._directory = directory
-        self._samples: dict[tuple[str, str], dict[str, Sample]] = {}
+        self._samples: dict[str, dict[str, Sample]] = {}
         self._records: dict[tuple[str, str], list[dict[str, Any]]] = {}
         self._result: dict[str, Any] | None = None
         for entry in entries:
@@ -141,19 +137,22 @@ class History:
         """Take in one more event."""
         data = entry.data
         if entry.kind == "sample":
-            step = self._samples.setdefault((data["scope"], data["step"]), {})
-            step[data["key"]] = self._sample(data)
+            self._samples.setdefault(entry.at, {})[data["key"]] = self._sample(data)
         elif entry.kind == "record":
-            self._records.setdefault((data["scope"], data["name"]), []).append(data["data"])
+            self._records.setdefault((entry.at, data["name"]), []).append(data["data"])
         elif entry.kind == "result":
             self._result = data
 
-    def samples(self, scope: str, step: str) -> dict[str, Sample]:
-        """The samples of one step by their keys, in the order in which they were taken."""
-        return dict(self._samples.get((scope, step), {}))
+    def samples(self, step: str) -> dict[str, Sample]:
+        """The samples of a step, as `<scope>/<step>`, by key and in the order they were taken."""
+        return dict(self._samples.get(step, {}))
+
+    def steps(self) -> dict[str, dict[str, Sample]]:
+        """All samples, by step and key."""
+        return {step: dict(samples) for step, samples in self._samples.items()}
 
     def records(self, scope: str, name: str) -> list[dict[str, Any]]:
-        """What was recorded as `name`, oldest first."""
+        """What was recorded as `name` in a scope, oldest first."""
         return list(self._records.get((scope, name), []))
 
     def result(self) -> dict[str, Any] | None:

@@ -88,7 +88,7 @@ class Child:
         exception of it; DeviceFault, which names function and cause, when it took longer than
         `timeout_s` or its process died. Cancelling the call kills the process.
         """
-        what = f"{function.__module__}.{function.__qualname__}"
+        what = f"{function.__module__}.{getattr(function, '__qualname__', function)}"
         if function.__module__ == "__main__":
             raise ValueError(f"{what}: a child can only import functions of a module")
         request = pack((function, args))

@@ -132,14 +132,14 @@ async def test_a_procedure_is_given_the_calibration_that_was_active_at_its_start
 async def test_scopes_keep_chained_procedures_apart(toy):
     info = await toy.ended(await toy.start("chained", views=2))
     assert (info.status, info.samples) == ("done", 4)
-    samples = [e.data for e in toy.journal(info.run_id) if e.kind == "sample"]
-    assert [(s["scope"], s["step"], s["key"]) for s in samples] == [
-        ("first", "collect", "view-000"),
-        ("first", "collect", "view-001"),
-        ("second", "collect", "view-000"),
-        ("second", "collect", "view-001"),
+    samples = [e for e in toy.journal(info.run_id) if e.kind == "sample"]
+    assert [(sample.at, sample.data["key"]) for sample in samples] == [
+        ("first/collect", "view-000"),
+        ("first/collect", "view-001"),
+        ("second/collect", "view-000"),
+        ("second/collect", "view-001"),
     ]
-    means = {sample["data"]["point"][1] for sample in samples}
+    means = {sample.data["data"]["point"][1] for sample in samples}
     assert len(means) == 4, "each sample has noise of its own"
 
 
@@ -374,6 +374,16 @@ async def test_a_fault_survives_a_restart(tmp_path):
     async with bench(tmp_path) as toy:
         assert toy.engine.state().phase == "idle"
         assert (await toy.engine.run_info(run_id)).status == "interrupted"
+
+
+async def test_abandoning_a_run_does_not_acknowledge_its_fault(tmp_path):
+    async with bench(tmp_path) as toy:
+        run_id = await toy.start("troubled", kind="fault")
+        await toy.phase("fault")
+        await toy.cancel(run_id)
+        assert toy.engine.state().phase == "fault"
+    async with bench(tmp_path) as toy:
+        assert toy.engine.state().fault == "the camera was unplugged"
 
 
 @pytest.mark.parametrize("how", ["stop_fails", "stop_hangs"])

@@ -44,9 +44,10 @@ def test_what_was_appended_is_read_again(tmp_path):
 
 def test_append_returns_what_a_reader_will_see(tmp_path):
     journal = Journal.create(tmp_path / "journal.jsonl", "run-1")
-    entry = journal.append("event", {"tuple": (1, 2), "nested": {3: "three"}})
+    entry = journal.append("event", {"tuple": (1, 2), "nested": {3: "three"}}, at="a/b")
     journal.close()
     assert entry.data == {"tuple": [1, 2], "nested": {"3": "three"}}
+    assert (entry.kind, entry.at) == ("event", "a/b")
     assert read(tmp_path / "journal.jsonl").intact()[1] == entry
 
 
@@ -79,7 +80,7 @@ def test_a_torn_line_is_moved_aside_and_its_number_used_again(tmp_path):
     assert (tmp_path / torn[0]).read_bytes() == last_line[:-5]
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.data())
 def test_a_flipped_byte_is_named_and_the_other_lines_are_rescued(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "flipped.jsonl"
@@ -136,8 +137,11 @@ def test_a_newer_journal_is_refused(tmp_path, monkeypatch):
 
 def test_what_is_no_json_leaves_the_journal_as_it_is(tmp_path):
     journal = Journal.create(tmp_path / "journal.jsonl", "run-1")
-    with pytest.raises(BadInput, match=r"sample of .*cannot be written as JSON"):
-        journal.append("sample", {"value": float("nan")})
+    with pytest.raises(BadInput, match=r"sample a/b: cannot be written as JSON"):
+        journal.append("sample", {"value": float("nan")}, at="a/b")
+    for kind, at in (("Two words", ""), ("sample", 'a"b'), ("sample", "a\nb")):
+        with pytest.raises(ValueError, match="plain names"):
+            journal.append(kind, {}, at=at)
     assert journal.append("sample", {"value": 1.0}).n == 1
     journal.close()
     assert len(read(tmp_path / "journal.jsonl").intact()) == 2

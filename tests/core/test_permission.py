@@ -92,7 +92,7 @@ def test_durations(text, seconds):
     assert parse_duration(text) == seconds
 
 
-@given(st.text(max_size=12))
+@given(st.text("0123456789hms -.x\n", max_size=12))
 def test_other_durations_are_bad_input(text):
     if re.fullmatch(r"\s*(?=\d)(\d{1,6}h)?(\d{1,6}m)?(\d{1,6}s)?\s*", text):
         assert parse_duration(text) >= 0

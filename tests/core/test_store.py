@@ -35,10 +35,6 @@ def header(run_id="run-1", **changed):
     return RunHeader(**{**values, **changed})
 
 
-def place(key, step="collect", scope=""):
-    return {"scope": scope, "step": step, "key": key}
-
-
 @pytest.fixture
 async def store(tmp_path):
     store = await Store.open(tmp_path / "data")
@@ -75,10 +71,10 @@ async def test_a_sample_and_its_images_are_read_again_exactly(store):
     record = await store.create(header())
     data = {"joints": np.array([0.1, 1 / 3]), "n": np.int64(3)}
     await record.append_sample(
-        place("a"), data, {"camera": IMAGE, "colour": np.stack([IMAGE] * 3, 2)}
+        "collect", "a", data, {"camera": IMAGE, "colour": np.stack([IMAGE] * 3, 2)}
     )
     await record.close()
-    sample = read_run(record.directory).history.samples("", "collect")["a"]
+    sample = read_run(record.directory).history.samples("collect")["a"]
     assert sample.data == {"joints": [0.1, 1 / 3], "n": 3}
     assert np.array_equal(sample.images["camera"].load(), IMAGE)
     assert sample.images["colour"].load().shape == (60, 80, 3)
@@ -87,9 +83,9 @@ async def test_a_sample_and_its_images_are_read_again_exactly(store):
 
 async def test_a_changed_or_missing_image_is_named(store):
     record = await store.create(header())
-    await record.append_sample(place("a"), {}, {"camera": IMAGE})
+    await record.append_sample("collect", "a", {}, {"camera": IMAGE})
     await record.close()
-    picture = record.history.samples("", "collect")["a"].images["camera"]
+    picture = record.history.samples("collect")["a"].images["camera"]
     content = bytearray(picture.path.read_bytes())
     content[len(content) // 2] ^= 1
     picture.path.write_bytes(content)
@@ -102,17 +98,20 @@ async def test_a_changed_or_missing_image_is_named(store):
 
 async def test_scopes_and_steps_are_kept_apart(store):
     record = await store.create(header())
-    for scope, step in (("", "collect"), ("a", "collect"), ("a/b", "collect"), ("a", "b")):
-        await record.append("step", scope=scope, step=step, total=3)
-        await record.append_sample(place("k", step, scope), {"at": [scope, step]}, {"i": IMAGE})
-        await record.append("record", scope=scope, name="note", data={"at": scope})
+    places = ["collect", "a/collect", "a/b/collect", "a/b"]
+    for place in places:
+        await record.append("step", at=place, total=3)
+        await record.append_sample(place, "k", {"at": place}, {"i": IMAGE})
+        await record.append("record", at=place, name="note", data={"at": place})
     history = record.history
-    assert history.samples("a", "collect")["k"].data == {"at": ["a", "collect"]}
-    assert history.samples("a", "b")["k"].data == {"at": ["a", "b"]}
+    assert {step: samples["k"].data for step, samples in history.steps().items()} == {
+        place: {"at": place} for place in places
+    }
     assert history.records("a/b", "note") == [{"at": "a/b"}]
-    assert history.samples("b", "collect") == {}
+    assert history.samples("b") == {}
     assert len(list((record.directory / "images").iterdir())) == 4
     assert record.folder.standing.samples == 4
+    assert record.folder.info().progress.step == "a/b"
     await record.close()
 
 
