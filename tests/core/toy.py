@@ -26,7 +26,7 @@ from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
 from cellctl.drivers.base import Path as Joints
 from cellctl.engine import Engine
-from cellctl.errors import BadInput, DeviceFault, MotionRefused
+from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotEnabled
 from cellctl.geometry import Transform
 from cellctl.journal import Entry, read
 from cellctl.messages import (
@@ -251,6 +251,18 @@ async def _late_fault(run: Run, params: Trouble) -> None:
         raise DeviceFault("the arm did not stop when it was told to") from None
 
 
+async def _not_enabled(run: Run, params: Trouble) -> None:
+    raise NotEnabled("the permission to move ended")
+
+
+async def _busy(run: Run, params: Trouble) -> None:
+    """Swallows its cancellation, and then computes and computes."""
+    with contextlib.suppress(asyncio.CancelledError):
+        await asyncio.sleep(params.seconds)
+    while True:
+        await run.checkpoint()
+
+
 async def _wait(run: Run, params: Trouble) -> None:
     await asyncio.sleep(params.seconds)
 
@@ -273,6 +285,8 @@ TROUBLES = {
     "cancels itself": _cancels_itself,
     "stubborn": _stubborn,
     "late fault": _late_fault,
+    "not enabled": _not_enabled,
+    "busy": _busy,
     "wait": _wait,
 }
 
