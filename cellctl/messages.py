@@ -60,13 +60,21 @@ class CancelRequest(Command):
 
 
 class AckRequest(Command):
-    """Acknowledges a fault, or answers the operator question of a waiting run."""
+    """Acknowledges a fault, or answers the operator question of a waiting run.
+
+    `question` is the id of the question that is answered: with it, an answer that comes late is
+    refused instead of being taken for another question's, or for a fault's acknowledgement.
+    """
 
     answer: str = Field(default="ok", max_length=1000)
+    question: int | None = None
 
 
 class PromoteRequest(Command):
+    """Makes a calibration the active one; one that failed its verdict only if that is said."""
+
     calibration_id: str
+    despite_failed_verdict: bool = False
 
 
 class Accepted(Message):
@@ -85,8 +93,9 @@ class Error(Message):
 
 
 class Question(Message):
-    """What a waiting run asks its operator."""
+    """What a waiting run asks its operator; `id` is the number of its journal line."""
 
+    id: int = 0
     text: str
     choices: list[str] = ["ok"]
 
@@ -110,7 +119,10 @@ class RobotSnapshot(Message):
 
 
 class State(Message):
-    """An immutable snapshot of the daemon."""
+    """An immutable snapshot of the daemon, as of event `seq`.
+
+    `enabled`: motion is permitted, until `enabled_until` (wall clock, s; None: without end).
+    """
 
     cell: str
     boot: str
@@ -122,6 +134,7 @@ class State(Message):
     fault: str | None = None
     progress: Progress | None = None
     active_calibration: str | None = None
+    enabled: bool = False
     enabled_until: float | None = None
     simulated: bool = False
     wall_time: float
