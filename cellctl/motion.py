@@ -245,8 +245,7 @@ def _hull(name: str, hull: Box) -> Body:
 class GuardedRobot:
     """A Robot whose every motion is allowed by a person and by the guard, and capped in speed.
 
-    `permission()` raises NotEnabled when motion is not allowed now; `speed` is the fraction of
-    the configured speed that the present run may use.
+    `permission()` raises NotEnabled when motion is not allowed now.
     """
 
     def __init__(
@@ -255,7 +254,6 @@ class GuardedRobot:
         self._robot, self.guard, self._permission = robot, guard, permission
         self._joint_speed = float(np.radians(config.robot.joint_speed_deg_s))
         self._tcp_speed = config.robot.tcp_speed_m_s
-        self.speed = 1.0
 
     async def identity(self) -> Identity:
         return await self._robot.identity()
@@ -291,4 +289,4 @@ class GuardedRobot:
     def _capped(self, start: Array, target: Target) -> float:
         tip = self.guard.tip_speed(start, target.path, self._joint_speed)
         cap = 1.0 if tip <= self._tcp_speed else self._tcp_speed / tip
-        return min(target.speed * self.speed, cap)
+        return min(target.speed, cap)
