@@ -136,14 +136,22 @@ class Client:
         request = _made(CancelRequest, client=self.label, run_id=run_id)
         return self._queries.ask("cmd/cancel", Accepted, request)
 
-    def ack(self, answer: str = "ok") -> Accepted:
-        """Acknowledge a fault, or answer the question of a waiting run."""
-        return self._queries.ask(
-            "cmd/ack", Accepted, _made(AckRequest, client=self.label, answer=answer)
-        )
+    def ack(self, answer: str = "ok", *, question: int | None = None) -> Accepted:
+        """Acknowledge a fault, or answer the question of a waiting run.
 
-    def promote(self, calibration_id: str) -> Accepted:
-        request = _made(PromoteRequest, client=self.label, calibration_id=calibration_id)
+        With the id of the `question` an answer that comes late is refused.
+        """
+        request = _made(AckRequest, client=self.label, answer=answer, question=question)
+        return self._queries.ask("cmd/ack", Accepted, request)
+
+    def promote(self, calibration_id: str, *, despite_failed_verdict: bool = False) -> Accepted:
+        """Make a calibration the active one; one that failed its verdict only if that is said."""
+        request = _made(
+            PromoteRequest,
+            client=self.label,
+            calibration_id=calibration_id,
+            despite_failed_verdict=despite_failed_verdict,
+        )
         return self._queries.ask("cmd/promote", Accepted, request)
 
     def watch(self, run_id: str | None = None) -> Generator[Update]:

@@ -132,7 +132,8 @@ class Follower:
         if self._run_id is None:
             yield event
         elif event.run_id == self._run_id:
-            self._poll_soon()
+            if event.kind == "ended":
+                self._poll_soon()
             yield event
 
     def _on_progress(self, progress: Progress | None) -> Iterator[Update]:

@@ -10,61 +10,31 @@ import difflib
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import structlog
 from pydantic import ValidationError
 
 from cellctl.bus.keys import check_name
+from cellctl.engine import Engine
 from cellctl.errors import BadInput, CellctlError, NotFound
 from cellctl.messages import (
-    Accepted,
     AckRequest,
-    CalibrationInfo,
     CancelRequest,
     Command,
     Error,
-    Event,
-    Events,
     Message,
-    Procedures,
-    Progress,
     PromoteRequest,
     ResumeRequest,
-    RunAccepted,
-    RunInfo,
     RunRequest,
     Runs,
-    State,
 )
 
 MAX_PAYLOAD_BYTES = 64 * 1024
 MAX_TEXT = 4000
 DEFAULT_RUNS = 50
 
-Published = State | Event | Progress
-
 _log = structlog.get_logger(__name__)
-
-
-class Engine(Protocol):
-    """What the bus asks of the engine. All of it is called on the event loop."""
-
-    def state(self) -> State: ...
-    def events(self, since: int) -> Events: ...
-    def procedures(self) -> Procedures: ...
-    def subscribe(self, callback: Callable[[Published], None]) -> Callable[[], None]:
-        """`callback` gets all that happens, on the loop; the returned function ends it."""
-        ...
-
-    async def start(self, procedure: str, request: RunRequest) -> RunAccepted: ...
-    async def resume(self, request: ResumeRequest) -> RunAccepted: ...
-    async def cancel(self, request: CancelRequest) -> Accepted: ...
-    async def ack(self, request: AckRequest) -> Accepted: ...
-    async def promote(self, request: PromoteRequest) -> Accepted: ...
-    async def run_info(self, run_id: str) -> RunInfo: ...
-    async def runs(self) -> Runs: ...
-    async def calibration(self, calibration_id: str) -> CalibrationInfo: ...
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from cellctl.bus.keys import Keys
 from cellctl.bus.publications import Publications, encoding
 from cellctl.bus.requests import (
     MAX_PAYLOAD_BYTES,
-    Engine,
     Request,
     answer,
     error_message,
@@ -32,6 +31,7 @@ from cellctl.bus.requests import (
 )
 from cellctl.bus.session import Settings, open_listening, plain
 from cellctl.drivers.base import Image
+from cellctl.engine import Engine
 from cellctl.errors import BadInput, Busy, CellctlError
 from cellctl.messages import Error, Message, RobotSnapshot
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -15,8 +16,8 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def daemon(endpoint: str) -> Iterator[Daemon]:
-    with Daemon(endpoint) as running:
+def daemon(endpoint: str, tmp_path: Path) -> Iterator[Daemon]:
+    with Daemon(endpoint, tmp_path) as running:
         yield running
 
 

@@ -6,7 +6,7 @@ import json
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 
 from cellctl.bus.requests import (
     MAX_PAYLOAD_BYTES,
@@ -17,8 +17,8 @@ from cellctl.bus.requests import (
     error_message,
 )
 from cellctl.errors import BY_CODE, BadInput, DeviceFault
-from cellctl.messages import Error, Message, Runs
-from tests.bus.toy import ToyEngine
+from cellctl.messages import Error, Message
+from tests.bus.toy import Daemon
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
@@ -46,19 +46,19 @@ PATHS = st.lists(CHUNKS | st.text(max_size=6), max_size=4).map("/".join) | st.sa
 PARAMETERS = st.dictionaries(st.sampled_from(["since", "limit", "x"]), st.text(max_size=6))
 
 
-async def ask(path: str, payload: object = b"", **parameters: str) -> Message:
+def ask(daemon: Daemon, path: str, payload: object = b"", **parameters: str) -> Message:
     body = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
-    engine = ToyEngine("toy", "b1")
-    try:
-        return await answer(engine, Request(path, parameters, body))
-    finally:
-        await engine.close()
+    return daemon.wait(lambda: answer(daemon.engine, Request(path, parameters, body)))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],  # one daemon takes them all
+)
 @given(PATHS, PARAMETERS, PAYLOADS)
-async def test_any_request_gets_an_answer_that_can_be_sent(path, parameters, payload):
-    message = await ask(path, payload, **parameters)
+def test_any_request_gets_an_answer_that_can_be_sent(daemon, path, parameters, payload):
+    message = ask(daemon, path, payload, **parameters)
     assert json.loads(message.model_dump_json())["v"] == 1
     if isinstance(message, Error):
         assert message.code in BY_CODE
@@ -89,40 +89,41 @@ async def test_any_request_gets_an_answer_that_can_be_sent(path, parameters, pay
         ("cmd/ack", b" " * (MAX_PAYLOAD_BYTES + 1), "bad_request", "65536 are allowed"),
     ],
 )
-async def test_errors_say_what_is_wrong(path, payload, code, text):
-    error = await ask(path, payload)
+def test_errors_say_what_is_wrong(daemon, path, payload, code, text):
+    error = ask(daemon, path, payload)
     assert isinstance(error, Error)
     assert error.code == code
     assert text in error.message
 
 
 @pytest.mark.parametrize("since", ["-1", "1.5", "x", "٣", "9" * 13])
-async def test_since_must_be_a_number(since):
-    error = await ask("get/events", since=since)
+def test_since_must_be_a_number(daemon, since):
+    error = ask(daemon, "get/events", since=since)
     assert isinstance(error, Error)
     assert "since" in error.message
 
 
-async def test_an_unforeseen_exception_is_internal_and_logged(capsys):
-    error = await ask("cmd/run/broken", {"request_id": "12345678"})
+def test_an_unforeseen_exception_is_internal_and_logged(daemon, monkeypatch, capsys):
+    def broken() -> None:
+        raise KeyError("nobody foresaw this")
+
+    monkeypatch.setattr(daemon.engine, "procedures", broken)
+    error = ask(daemon, "get/procedures")
     assert isinstance(error, Error)
     assert error.code == "internal"
     assert "nobody foresaw this" in error.message
     assert "Traceback" in capsys.readouterr().out
 
 
-async def test_runs_are_newest_first_and_without_results():
-    engine = ToyEngine("toy", "b1")
-    for number in range(3):
-        body = json.dumps({"request_id": f"request-{number}", "params": {"n": 0}}).encode()
-        await answer(engine, Request("cmd/run/count", {}, body))
-        assert engine._task
-        await engine._task
-    assert engine.known["r0001"].result
-    runs = await answer(engine, Request("get/runs", {"limit": "2"}))
-    assert isinstance(runs, Runs)
-    assert [run.run_id for run in runs.runs] == ["r0003", "r0002"]
-    assert all(run.result is None for run in runs.runs)
+def test_runs_are_newest_first_and_without_results(daemon, client):
+    started = []
+    for _ in range(3):
+        started.append(client.run("count", {"n": 0}).run_id)
+        list(client.watch(started[-1]))
+    assert client.run_info(started[-1]).result
+    runs = client.runs(limit=2).runs
+    assert [run.run_id for run in runs] == started[:0:-1]
+    assert all(run.result is None for run in runs)
 
 
 def test_details_that_json_cannot_hold_travel_as_text():

@@ -1,197 +1,142 @@
-"""A small engine that lives in memory, and a daemon around it, for tests of the bus.
+"""A daemon for tests of the bus: the real engine and store, procedures that only count.
 
-Its procedures count: `count` takes `n` steps of `pause_s`; `ask` waits for an answer; `broken`
-raises what nobody foresaw. Run as a program it serves until it is killed.
+`count` takes `n` samples, `pause_s` apart; `ask` waits for an answer. Run as a program it serves
+until it is killed: `python -m tests.bus.toy ENDPOINT DIRECTORY`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from typing import Self
+from pathlib import Path
+from typing import Any, Self, TypeVar
 
-from cellctl.bus.requests import Published
+from pydantic import BaseModel, ConfigDict, Field
+
 from cellctl.bus.server import Server
-from cellctl.errors import BadInput, Busy, CellctlError, NotFound
-from cellctl.messages import (
-    Accepted,
-    AckRequest,
-    CalibrationInfo,
-    CancelRequest,
-    Event,
-    Events,
-    ProcedureInfo,
-    Procedures,
-    Progress,
-    PromoteRequest,
-    Question,
-    ResumeRequest,
-    RunAccepted,
-    RunInfo,
-    RunRequest,
-    Runs,
-    State,
-)
+from cellctl.cell import Cell
+from cellctl.clock import MonotonicClock
+from cellctl.config import parse_config
+from cellctl.drivers import base
+from cellctl.engine import Engine
+from cellctl.errors import CellctlError, DeviceFault
+from cellctl.motion import guard_of
+from cellctl.permission import Permission
+from cellctl.run import Procedure, Result, Run
+from cellctl.store import Store
+from tests import cells
+
+CELL = "toy"
+T = TypeVar("T")
 
 
-class ToyEngine:
-    """One run at a time, idempotent by request id, forgetful at the end of the process."""
+class Count(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    n: int = Field(default=3, ge=0, le=2000)
+    pause_s: float = Field(default=0.0, ge=0, le=1)
+    verdict: str = "pass"
 
-    def __init__(self, cell: str, boot: str) -> None:
-        self.cell, self.boot = cell, boot
-        self.known: dict[str, RunInfo] = {}
-        self.requests: dict[str, str] = {}
-        self.active: str | None = None
-        self.stuck = asyncio.Event()
-        self._events: list[Event] = []
-        self._callbacks: list[Callable[[Published], None]] = []
-        self._task: asyncio.Task[None] | None = None
-        self._answer: asyncio.Future[str] | None = None
-        self._state_seq = 0
 
-    def state(self) -> State:
-        self._state_seq += 1
-        run = self.known[self.active] if self.active else None
-        return State(
-            cell=self.cell,
-            boot=self.boot,
-            seq=self._state_seq,
-            phase="idle" if run is None else "waiting" if run.question else "running",
-            active_run=self.active,
-            procedure=run.procedure if run else None,
-            progress=run.progress if run else None,
-            question=run.question if run else None,
-            simulated=True,
-            wall_time=time.time(),
-        )
+class Nothing(BaseModel):
+    model_config = ConfigDict(extra="forbid")
 
-    def events(self, since: int) -> Events:
-        return Events(boot=self.boot, events=[e for e in self._events if e.seq > since])
 
-    def procedures(self) -> Procedures:
-        names = ("count", "ask", "broken")
-        return Procedures(
-            procedures=[
-                ProcedureInfo(name=name, summary="a toy", moves=False, params={}) for name in names
-            ]
-        )
+async def count(run: Run, cell: Cell, params: Count) -> Result:
+    await run.step("counting", params.n)
+    for number in range(1, params.n + 1):
+        if str(number) not in run.samples():
+            await run.checkpoint()
+            await asyncio.sleep(params.pause_s)
+            await run.sample(str(number), {"number": number})
+        run.progress(number)
+    verdict: Any = params.verdict
+    stages = [{"stage": "counting", "numbers": params.n}]
+    reasons = [] if verdict == "pass" else ["it was asked to fail"]
+    return Result(verdict, reasons, {"stages": stages, "answer": 42.0}, {"camera": [1.0]})
 
-    def subscribe(self, callback: Callable[[Published], None]) -> Callable[[], None]:
-        self._callbacks.append(callback)
-        return lambda: self._callbacks.remove(callback)
 
-    def event(self, kind: str, run_id: str | None = None, **data: object) -> None:
-        event = Event(
-            boot=self.boot,
-            seq=len(self._events) + 1,
-            kind=kind,
-            wall_time=time.time(),
-            run_id=run_id,
-            data=data,
-        )
-        self._events.append(event)
-        self._publish(event)
-        self._publish(self.state())
+async def ask(run: Run, cell: Cell, params: Nothing) -> Result:
+    await run.ask("is the board on?", ["yes", "no"])
+    return Result("pass")
 
-    def _publish(self, message: Published) -> None:
-        for callback in self._callbacks:
-            callback(message)
 
-    async def start(self, procedure: str, request: RunRequest) -> RunAccepted:
-        if known := self.requests.get(request.request_id):
-            return RunAccepted(run_id=known, boot=self.boot, replayed=True)
-        if procedure == "broken":
-            raise KeyError("nobody foresaw this")
-        if procedure not in ("count", "ask"):
-            raise NotFound(f"no procedure {procedure!r}; known: count, ask, broken")
-        if self.active:
-            raise Busy(f"run {self.active} is active", active_run=self.active)
-        run_id = f"r{len(self.known) + 1:04d}"
-        self.requests[request.request_id] = run_id
-        self.known[run_id] = RunInfo(
-            run_id=run_id, procedure=procedure, status="running", started="now"
-        )
-        self.active = run_id
-        self._task = asyncio.create_task(self._run(self.known[run_id], request))
-        return RunAccepted(run_id=run_id, boot=self.boot)
+async def fault(run: Run, cell: Cell, params: Nothing) -> Result:
+    raise DeviceFault("the toy's spring is broken")
 
-    async def _run(self, run: RunInfo, request: RunRequest) -> None:
-        self.event("run_started", run.run_id, procedure=run.procedure)
-        try:
-            await (self._ask(run) if run.procedure == "ask" else self._count(run, request))
-            run.status, run.verdict = "done", "pass"
-            run.result = {"answer": 42.0}
-        except asyncio.CancelledError:
-            run.status = "cancelled"
-        self.active = None
-        self.event("run_ended", run.run_id, status=run.status)
 
-    async def _count(self, run: RunInfo, request: RunRequest) -> None:
-        total, pause_s = int(request.params.get("n", 3)), request.params.get("pause_s", 0.01)
-        for done in range(1, total + 1):
-            await asyncio.sleep(pause_s)
-            run.samples = done
-            run.progress = Progress(run_id=run.run_id, step="counting", done=done, total=total)
-            self._publish(run.progress)
-            self.event("sample", run.run_id, number=done)
+async def move(run: Run, cell: Cell, params: Nothing) -> Result:
+    return Result("pass")
 
-    async def _ask(self, run: RunInfo) -> None:
-        self._answer = asyncio.get_running_loop().create_future()
-        run.question = Question(text="is the board on?", choices=["yes", "no"])
-        run.status = "waiting"
-        self.event("question", run.run_id)
-        answer = await self._answer
-        run.question, run.status = None, "running"
-        self.event("answered", run.run_id, answer=answer)
 
-    async def resume(self, request: ResumeRequest) -> RunAccepted:
-        raise BadInput(f"run {request.run_id} has ended; only an interrupted one can be resumed")
+PROCEDURES = [
+    Procedure("count", "Counts.", Count, False, count),
+    Procedure("ask", "Asks the operator.", Nothing, False, ask),
+    Procedure("fault", "Breaks.", Nothing, False, fault),
+    Procedure("move", "Would move.", Nothing, True, move),
+]
 
-    async def cancel(self, request: CancelRequest) -> Accepted:
-        if not self.active or not self._task or request.run_id not in (None, self.active):
-            raise NotFound("no such run is active")
-        self._task.cancel()
-        return Accepted(message="cancelling", run_id=self.active)
 
-    async def ack(self, request: AckRequest) -> Accepted:
-        if self._answer is None or self._answer.done():
-            raise BadInput("nothing waits for an answer")
-        self._answer.set_result(request.answer)
-        return Accepted(message="answered")
+class Still:
+    """A robot, camera and projector that only say who they are: no procedure here uses them."""
 
-    async def promote(self, request: PromoteRequest) -> Accepted:
-        if request.calibration_id == "stuck":
-            await self.stuck.wait()
-        raise NotFound(f"no calibration {request.calibration_id!r}")
+    async def identity(self) -> base.Identity:
+        return base.Identity(driver="toy", model="still")
 
-    async def run_info(self, run_id: str) -> RunInfo:
-        if run_id not in self.known:
-            raise NotFound(f"no run {run_id!r}")
-        return self.known[run_id]
+    async def read(self) -> base.RobotState:
+        raise DeviceFault("it has no joints")
 
-    async def runs(self) -> Runs:
-        return Runs(runs=list(self.known.values()))
+    async def state_at(self, t: float) -> base.RobotState:
+        raise DeviceFault("it has no joints")
 
-    async def calibration(self, calibration_id: str) -> CalibrationInfo:
-        document = {"size": "x" * 200_000} if calibration_id == "large" else {"camera": [1.0]}
-        return CalibrationInfo(calibration_id=calibration_id, active=True, document=document)
+    async def check(self, path: base.Path) -> None:
+        raise DeviceFault("it does not move")
 
-    async def close(self) -> None:
-        self.stuck.set()
-        if self._task:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+    async def move(self, target: base.Target, *, timeout_s: float) -> base.RobotState:
+        raise DeviceFault("it does not move")
+
+    async def stop(self, *, clean: bool) -> None:
+        return
+
+    async def grab(self, *, exposed_after: float) -> base.Frame:
+        raise DeviceFault("it has no lens")
+
+    async def show(self, image: base.Image) -> float:
+        raise DeviceFault("it has no lamp")
+
+    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float) -> Any:
+        return function(*args)
+
+
+@contextlib.asynccontextmanager
+async def toy_engine(directory: Path) -> AsyncIterator[Engine]:
+    document = cells.document()
+    document["cell"] = {"id": CELL}
+    config = parse_config(document, "toy")
+    still = Still()
+    guard = guard_of(config)
+    cell = Cell(config, guard, still, still, still, MonotonicClock(), still)
+    store = await Store.open(directory)
+    engine = Engine(cell, PROCEDURES, store, Permission(directory))
+    try:
+        yield engine
+    finally:
+        await engine.shutdown()
+        await store.close()
 
 
 class Daemon:
-    """A toy daemon in a thread of this process. `call` runs a function on its loop."""
+    """A toy daemon in a thread of this process; its engine is reached by `call` and `wait`."""
 
-    def __init__(self, endpoint: str, cell: str = "toy", boot: str = "boot-1") -> None:
-        self.endpoint, self.cell, self.boot = endpoint, cell, boot
+    engine: Engine
+    server: Server
+
+    def __init__(self, endpoint: str, directory: Path) -> None:
+        self.endpoint, self._directory = endpoint, directory
         self._ready = threading.Event()
         self._error: CellctlError | None = None
         self._thread = threading.Thread(target=lambda: asyncio.run(self._serve()))
@@ -205,26 +150,44 @@ class Daemon:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._stop.set)
+        self.stop()
         self._thread.join(20)
         assert not self._thread.is_alive(), "the daemon did not close"
 
+    def stop(self) -> None:
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._stop.set)
+
     def call(self, function: Callable[[], object]) -> None:
+        """Call on the daemon's loop."""
         self._loop.call_soon_threadsafe(function)
+
+    def wait(self, function: Callable[[], Awaitable[T]]) -> T:
+        """Await on the daemon's loop."""
+
+        async def run() -> T:
+            return await function()
+
+        return asyncio.run_coroutine_threadsafe(run(), self._loop).result(10)
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        self.engine = ToyEngine(self.cell, self.boot)
-        self.server = Server(self.engine, self.endpoint, self.cell, self.boot)
         try:
-            async with self.server:
-                self._ready.set()
-                await self._stop.wait()
-                await self.engine.close()
+            async with toy_engine(self._directory) as self.engine:
+                self.server = Server(self.engine, self.endpoint, CELL, self.engine.boot)
+                async with self.server:
+                    self._ready.set()
+                    await self._stop.wait()
         except CellctlError as error:
             self._error = error
             self._ready.set()
+
+
+def store_large_calibration(daemon: Daemon) -> None:
+    """As `large`, 200 kB."""
+    content = {"verdict": "pass", "reasons": [], "calibration": "x" * 200_000}
+    store = daemon.engine._store
+    daemon.wait(lambda: store.in_order(store.calibrations.add, "large", content))
 
 
 @contextmanager
@@ -240,13 +203,15 @@ def deadline(seconds: float) -> Iterator[Callable[[], bool]]:
     yield late
 
 
-async def _main(endpoint: str, cell: str, boot: str) -> None:
-    engine = ToyEngine(cell, boot)
-    async with Server(engine, endpoint, cell, boot):
-        sys.stdout.write("ready\n")
+async def _main(endpoint: str, directory: str) -> None:
+    async with (
+        toy_engine(Path(directory)) as engine,
+        Server(engine, endpoint, CELL, engine.boot),
+    ):
+        sys.stdout.write(f"ready {engine.boot}\n")
         sys.stdout.flush()
         await asyncio.sleep(60)
 
 
 if __name__ == "__main__":
-    asyncio.run(_main(*sys.argv[1:4]))
+    asyncio.run(_main(*sys.argv[1:3]))

@@ -1,0 +1,68 @@
+"""Follow a run on stderr: a bar on a terminal, a line for each step elsewhere."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Self
+
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+from cellctl.bus.client import Client
+from cellctl.bus.follow import Link, Update
+from cellctl.cli import words
+from cellctl.cli.output import err, note
+from cellctl.messages import Event, Progress, RunInfo, State
+
+TOLD = ("started", "resumed", "step", "question", "ended")
+
+
+class ProgressBar:
+    """Shows how far a run is, if stderr is a terminal. A context manager."""
+
+    def __init__(self) -> None:
+        self._open = ExitStack()
+        self._bar: Bar | None = None
+
+    def __enter__(self) -> Self:
+        if err.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+            bar = Bar(*columns, TimeElapsedColumn(), console=err, transient=True)
+            self._bar = self._open.enter_context(bar)
+            self._task = bar.add_task("", total=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def show(self, update: Update) -> None:
+        """Whatever says something about progress; other updates are ignored."""
+        progress = update.progress if isinstance(update, State | RunInfo) else update
+        if self._bar and isinstance(progress, Progress):
+            self._bar.update(
+                self._task,
+                description=f"{progress.step} {progress.text}".strip(),
+                completed=progress.done,
+                total=progress.total or None,
+            )
+
+
+def follow(client: Client, run_id: str) -> RunInfo:
+    """Show a run until it ends or is interrupted."""
+    with ProgressBar() as bar:
+        for update in client.watch(run_id):
+            if isinstance(update, RunInfo):
+                return update
+            bar.show(update)
+            _tell(update)
+    raise AssertionError("watching a run ends with its RunInfo")
+
+
+def _tell(update: Update) -> None:
+    if isinstance(update, Event) and update.kind in TOLD:
+        note(words.line(update) or "")
+        if update.kind == "question":
+            for choice in update.data.get("choices", []):
+                note(f"  to answer: {words.answer_command(str(choice))}")
+    elif isinstance(update, Link):
+        note(words.line(update) or "")
