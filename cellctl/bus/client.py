@@ -58,12 +58,12 @@ class Client:
         cell: str | None = None,
         *,
         label: str | None = None,
-        security: Settings | None = None,
+        settings: Settings | None = None,
     ) -> None:
         self.endpoint = endpoint
         self.label = (label or _who())[:64]
         self._wanted = cell
-        self._security = security
+        self._security = settings
         self._open = ExitStack()
 
     def __enter__(self) -> Self:

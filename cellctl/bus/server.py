@@ -60,14 +60,14 @@ class Server:
         boot: str,
         *,
         robot: Callable[[], Awaitable[RobotSnapshot]] | None = None,
-        security: Settings | None = None,
+        settings: Settings | None = None,
     ) -> None:
         self._engine = engine
         self._endpoint = endpoint
         self._keys = Keys(cell_id)
         self._live = self._keys.live(boot)
         self._robot = robot
-        self._security = security
+        self._security = settings
         self._slots = threading.BoundedSemaphore(MAX_WAITING)
         self._answers: set[asyncio.Task[None]] = set()
         self._open = False

@@ -17,46 +17,68 @@ import zenoh
 from cellctl.errors import BadInput, Unreachable
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
-CONNECT_S = 2.0
-LEASE_MS = 3000
-"""After this long without a sign of life the other side counts as gone."""
-MAX_SESSIONS = 32
-MAX_MESSAGE_BYTES = {"peer": 1 << 20, "client": 64 << 20}
-"""What a session accepts: the daemon gets commands, the client may get a whole calibration."""
-BLOCKED_LINK_US = 500_000
-"""A link that takes nothing for this long while a reply waits for it is closed: some megabytes
-of answers are then unread, so on loopback the other side has stopped."""
+MAX_REQUEST_BYTES = 1 << 20
+MAX_ANSWER_BYTES = 64 << 20
 
 Settings = Mapping[str, object]
 """Zenoh configuration by path, as `{"transport/link/tls": {...}, "access_control": {...}}`."""
+
+COMMON: Settings = {
+    "listen/exit_on_failure": True,
+    "connect/timeout_ms": 2000,
+    "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2},
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "adminspace/enabled": False,
+    "transport/unicast/max_sessions": 32,
+    "transport/unicast/open_timeout": 2000,
+    "transport/link/protocols": ["tcp"],
+    # After so many ms without a sign of life the other side counts as gone.
+    "transport/link/tx/lease": 3000,
+    # A link that takes nothing for so many us while a reply waits for it is closed. Some
+    # megabytes of answers are then unread: on loopback, the other side has stopped.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 500_000,
+    # Nothing here is large, and a killed process leaves its shared segments behind.
+    "transport/shared_memory/enabled": False,
+}
 
 _ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9a-fA-F:.]+\]|[^\[\]:/?#]+):(?P<port>\d{1,5})")
 _SOURCE_PLACE = re.compile(r"\s+at /\S+?\.rs:\d+")
 
 
-def open_listening(endpoint: str, security: Settings | None = None) -> zenoh.Session:
+def open_listening(endpoint: str, settings: Settings | None = None) -> zenoh.Session:
     """The daemon's session. BadInput when the endpoint is malformed, not loopback or taken.
 
-    `security` is laid over the settings: the place for TLS and access control.
+    `settings` are laid over those given here: the place for TLS and access control.
     """
     check_endpoint(endpoint)
-    settings = _settings("peer", listen=[endpoint], connect=[]) | dict(security or {})
+    daemon: Settings = {
+        "mode": "peer",
+        "listen/endpoints": [endpoint],
+        "connect/endpoints": [],
+        "transport/link/rx/max_message_size": MAX_REQUEST_BYTES,
+    }
     try:
-        return zenoh.open(_config(settings))
+        return zenoh.open(_config(COMMON, daemon, settings or {}))
     except zenoh.ZError as error:
         raise BadInput(_cannot_listen(endpoint, plain(error)), endpoint=endpoint) from None
 
 
-def open_connected(endpoint: str, security: Settings | None = None) -> zenoh.Session:
+def open_connected(endpoint: str, settings: Settings | None = None) -> zenoh.Session:
     """A client's session. Unreachable when nobody listens there, BadInput when malformed."""
     check_endpoint(endpoint)
-    settings = _settings("client", listen=[], connect=[endpoint]) | dict(security or {})
+    client: Settings = {
+        "mode": "client",
+        "listen/endpoints": [],
+        "connect/endpoints": [endpoint],
+        "transport/link/rx/max_message_size": MAX_ANSWER_BYTES,
+    }
     try:
-        return zenoh.open(_config(settings))
+        return zenoh.open(_config(COMMON, client, settings or {}))
     except zenoh.ZError as error:
         raise Unreachable(
-            f"nobody answers at {endpoint} within {CONNECT_S:g} s. Is `cellctl serve` running "
-            "there? Another endpoint is given with --connect or CELLCTL_CONNECT.",
+            f"nobody answers at {endpoint}. Is `cellctl serve` running there? Another endpoint is "
+            "given with --connect or CELLCTL_CONNECT.",
             reason=plain(error),
             endpoint=endpoint,
         ) from None
@@ -105,35 +127,10 @@ def _cannot_listen(endpoint: str, reason: str) -> str:
     return f"cannot listen at {endpoint}: {reason}"
 
 
-def _settings(mode: str, *, listen: list[str], connect: list[str]) -> dict[str, object]:
-    milliseconds = int(CONNECT_S * 1000)
-    return {
-        "mode": mode,
-        "listen/endpoints": listen,
-        "listen/exit_on_failure": True,
-        "connect/endpoints": connect,
-        "connect/timeout_ms": milliseconds,
-        "connect/retry": {
-            "period_init_ms": 250,
-            "period_max_ms": 1000,
-            "period_increase_factor": 2,
-        },
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "adminspace/enabled": False,
-        "transport/unicast/max_sessions": MAX_SESSIONS,
-        "transport/unicast/open_timeout": milliseconds,
-        "transport/link/protocols": ["tcp"],
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": BLOCKED_LINK_US,
-        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES[mode],
-        # Nothing here is large, and a killed process leaves its shared segments behind.
-        "transport/shared_memory/enabled": False,
-    }
-
-
-def _config(settings: Settings) -> zenoh.Config:
+def _config(*layers: Settings) -> zenoh.Config:
+    """Later layers win."""
     config = zenoh.Config()
-    for path, value in settings.items():
-        config.insert_json5(path, json.dumps(value))
+    for layer in layers:
+        for path, value in layer.items():
+            config.insert_json5(path, json.dumps(value))
     return config

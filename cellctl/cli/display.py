@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Self
-
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
+from typing import TYPE_CHECKING, Self
 
 from cellctl.bus.client import Client
 from cellctl.bus.follow import Link, Update
@@ -14,7 +11,10 @@ from cellctl.cli import words
 from cellctl.cli.output import err, note
 from cellctl.messages import Event, Progress, RunInfo, State
 
-TOLD = ("started", "resumed", "step", "question", "ended")
+if TYPE_CHECKING:
+    import rich.progress
+
+TOLD = ("started", "resumed", "step", "question")
 
 
 class ProgressBar:
@@ -22,14 +22,12 @@ class ProgressBar:
 
     def __init__(self) -> None:
         self._open = ExitStack()
-        self._bar: Bar | None = None
+        self._bar: rich.progress.Progress | None = None
 
     def __enter__(self) -> Self:
         if err.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-            bar = Bar(*columns, TimeElapsedColumn(), console=err, transient=True)
-            self._bar = self._open.enter_context(bar)
-            self._task = bar.add_task("", total=None)
+            self._bar = self._open.enter_context(_bar())
+            self._task = self._bar.add_task("", total=None)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -47,6 +45,19 @@ class ProgressBar:
             )
 
 
+def _bar() -> rich.progress.Progress:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=err, transient=True)
+
+
 def follow(client: Client, run_id: str) -> RunInfo:
     """Show a run until it ends or is interrupted."""
     with ProgressBar() as bar:
@@ -60,9 +71,8 @@ def follow(client: Client, run_id: str) -> RunInfo:
 
 def _tell(update: Update) -> None:
     if isinstance(update, Event) and update.kind in TOLD:
-        note(words.line(update) or "")
-        if update.kind == "question":
-            for choice in update.data.get("choices", []):
-                note(f"  to answer: {words.answer_command(str(choice))}")
+        note(words.event(update, of_one_run=True))
+        for choice in update.data.get("choices", []):
+            note(f"  to answer: {words.answer_command(str(choice))}")
     elif isinstance(update, Link):
-        note(words.line(update) or "")
+        note(words.link(update))

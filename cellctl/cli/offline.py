@@ -61,7 +61,7 @@ def plan(
     from cellctl.config import load_config
     from cellctl.plan_view import draw_plan
 
-    facts = draw_plan(load_config(config), procedure, out)
+    facts = draw_plan(procedure, load_config(config), out)
     if as_json:
         emit(facts)
     else:

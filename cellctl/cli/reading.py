@@ -35,7 +35,7 @@ def _print_state(state: State, endpoint: str) -> None:
     kind = "simulated" if state.simulated else "real"
     rows = {
         "cell": f"{state.cell} ({kind}) at {endpoint}",
-        "phase": words.standing(state).removeprefix(f"cell {state.cell} is "),
+        "phase": words.standing(state),
         "step": words.progress(state.progress) if state.progress else None,
         "asks": state.question.text if state.question else None,
         "answer": _commands(state),

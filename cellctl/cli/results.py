@@ -52,8 +52,8 @@ def print_table(title: str, rows: list[dict[str, Any]]) -> None:
     """Rows with the same keys; more than 40 are cut."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    for column in columns:
-        table.add_column(column, overflow="fold")
+    for number, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=number == 0)  # names stay whole
     for row in rows[:MAX_ROWS]:
         table.add_row(*(short(row.get(column)) for column in columns))
     out.print(table)

@@ -24,10 +24,10 @@ DETACHED_BY_USER = 130
 
 
 def _complete(incomplete: str) -> list[str]:
-    """The names of a live daemon's procedures, or none."""
-    endpoint = os.environ.get("CELLCTL_CONNECT", HERE)
+    """The names of a live daemon's procedures; none when nobody answers at once."""
+    endpoint, cell = os.environ.get("CELLCTL_CONNECT", HERE), os.environ.get("CELLCTL_CELL")
     try:
-        with connect(endpoint, os.environ.get("CELLCTL_CELL")) as client:
+        with Client(endpoint, cell, settings={"connect/timeout_ms": 300}) as client:
             names = [procedure.name for procedure in client.procedures().procedures]
     except CellctlError:
         return []

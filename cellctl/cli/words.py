@@ -75,22 +75,33 @@ def progress(value: Progress) -> str:
 def line(update: Update) -> str | None:
     """An update as one line; None for progress, which is a bar."""
     if isinstance(update, Event):
-        run = f" {update.run_id}" if update.run_id else ""
-        return f"{clock(update.wall_time)} {update.kind}{run}{_data(update.data)}"
+        return event(update)
     if isinstance(update, Link):
-        text = "the daemon is back" if update.alive else "the daemon is gone; waiting for it"
-        return f"{clock(time.time())} {text} (boot {update.boot})"
+        return link(update)
     if isinstance(update, State):
-        return f"{clock(update.wall_time)} {standing(update)}"
+        return f"{clock(update.wall_time)} {update.cell} is {standing(update)}"
     return None
+
+
+def event(value: Event, *, of_one_run: bool = False) -> str:
+    """What happened; the run is left out when there is only one it can be."""
+    run = "" if of_one_run or value.run_id is None else f" {value.run_id}"
+    data = {k: v for k, v in value.data.items() if k not in ("scope", "step", "key")}
+    where = "/".join(filter(None, map(value.data.get, ("scope", "step", "key"))))
+    return f"{clock(value.wall_time)} {value.kind}{run}{where and ' ' + where}{_data(data)}"
+
+
+def link(value: Link) -> str:
+    text = "the daemon is back" if value.alive else "the daemon is gone; waiting for it"
+    return f"{clock(time.time())} {text} (boot {value.boot})"
 
 
 def standing(state: State) -> str:
     """What the cell does, in a few words."""
     if state.phase == "fault":
-        return f"cell {state.cell}: FAULT. {state.fault}"
-    doing = f" {state.procedure} (run {state.active_run})" if state.active_run else ""
-    return f"cell {state.cell} is {state.phase}{doing}"
+        return f"FAULT: {state.fault}"
+    doing = f": {state.procedure} (run {state.active_run})" if state.active_run else ""
+    return f"{state.phase}{doing}"
 
 
 def clock(wall_time: float) -> str:
