@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 from cellctl.bus.client import Client
 from cellctl.bus.follow import Link, Update
 from cellctl.cli import words
-from cellctl.cli.output import err, note
+from cellctl.cli.output import err, note, out, say
 from cellctl.messages import Event, Progress, RunInfo, State
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class ProgressBar:
     def __enter__(self) -> Self:
         if err.is_terminal:
             self._bar = self._open.enter_context(_bar())
-            self._task = self._bar.add_task("", total=None)
+            self._task = self._bar.add_task("", total=None, visible=False)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -35,14 +35,26 @@ class ProgressBar:
 
     def show(self, update: Update) -> None:
         """Whatever says something about progress; other updates are ignored."""
+        if self._bar is None:
+            return
         progress = update.progress if isinstance(update, State | RunInfo) else update
-        if self._bar and isinstance(progress, Progress):
+        if isinstance(progress, Progress):
             self._bar.update(
                 self._task,
                 description=f"{progress.step} {progress.text}".strip(),
                 completed=progress.done,
                 total=progress.total or None,
+                visible=True,
             )
+        elif isinstance(update, Event) and update.kind == "ended":
+            self._bar.update(self._task, visible=False)
+
+    def say(self, text: str) -> None:
+        """A line of the result, above the bar if both are on one terminal."""
+        if self._bar is not None and out.is_terminal:
+            note(text)
+        else:
+            say(text)
 
 
 def _bar() -> rich.progress.Progress:
@@ -54,8 +66,15 @@ def _bar() -> rich.progress.Progress:
         TimeElapsedColumn,
     )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), console=err, transient=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=err,
+        transient=True,
+        redirect_stdout=False,  # else what belongs on stdout would be printed on stderr
+    )
 
 
 def follow(client: Client, run_id: str) -> RunInfo:

@@ -115,8 +115,12 @@ def watch(
             for update in _news(client.watch(run_id)):
                 if isinstance(update, RunInfo):
                     return conclude(update, as_json)
-                _print_update(update, as_json)
                 bar.show(update)
+                if as_json:
+                    fields = update.model_dump() if isinstance(update, BaseModel) else vars(update)
+                    emit({"type": type(update).__name__, **fields})
+                elif text := words.line(update):
+                    bar.say(text)
     except KeyboardInterrupt:
         pass
     return 0
@@ -133,14 +137,6 @@ def _news(updates: Iterable[Update]) -> Iterator[Update]:
                 continue
             last = state
         yield update
-
-
-def _print_update(update: Update, as_json: bool) -> None:
-    if as_json:
-        fields = update.model_dump() if isinstance(update, BaseModel) else vars(update)
-        emit({"type": type(update).__name__, **fields})
-    elif text := words.line(update):
-        say(text)
 
 
 def cancel(

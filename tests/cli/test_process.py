@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -17,13 +18,13 @@ ROOT = Path(__file__).parents[2]
 HEAVY = {"cv2", "matplotlib", "numpy", "reportlab", "scipy", "sklearn", "structlog"}
 
 
-def start(daemon: Daemon, *arguments: str) -> subprocess.Popen[str]:
+def start(daemon: Daemon, *arguments: str, stderr: int = subprocess.PIPE) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "cellctl", *arguments],
         cwd=ROOT,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "CELLCTL_CONNECT": daemon.endpoint},
     )
@@ -85,6 +86,21 @@ def test_a_watcher_ends_cleanly_with_ctrl_c(daemon):
     _, err = process.communicate(timeout=10)
     assert (process.returncode, err) == (0, "")
     assert kinds == [(kind, run_id) for kind in ("started", "step", "sample", "sample", "ended")]
+
+
+def test_a_bar_on_a_terminal_leaves_stdout_alone(daemon):
+    terminal, slave = pty.openpty()
+    with Client(daemon.endpoint) as client:
+        run_id = client.run("count", {"n": 30, "pause_s": 0.05}).run_id
+    process = start(daemon, "watch", run_id, stderr=slave)
+    os.close(slave)
+    out, _ = process.communicate(timeout=30)
+    shown = os.read(terminal, 1 << 16).decode()
+    os.close(terminal)
+    assert process.returncode == 0
+    assert len([line for line in out.splitlines() if " sample " in line]) == 30
+    assert "/30" in shown
+    assert " sample " not in shown
 
 
 def test_talking_to_a_daemon_imports_nothing_heavy():
