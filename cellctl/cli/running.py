@@ -80,7 +80,7 @@ def _say_started(accepted: RunAccepted, as_json: bool) -> int:
 
 def _wait(client: Client, accepted: RunAccepted, as_json: bool) -> int:
     if accepted.replayed:
-        note(f"this request was taken before, as run {accepted.run_id}")
+        note(f"this is run {accepted.run_id}, which was started before")
     try:
         ended = follow(client, accepted.run_id)
     except KeyboardInterrupt:

@@ -379,7 +379,7 @@ async def test_robot_snapshots_survive_a_robot_that_cannot_be_read(endpoint, tmp
             hear = lambda sample: loop.call_soon_threadsafe(came.set)  # noqa: E731
             with session.declare_subscriber(KEYS.robot, hear):
                 await asyncio.wait_for(came.wait(), 5)
-    assert reads == 3 or reads == 4
+    assert reads >= 3
 
 
 def test_a_trigger_reads_as_documented(client):

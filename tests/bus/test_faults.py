@@ -89,7 +89,7 @@ def test_a_frozen_watcher_stalls_neither_the_daemon_nor_others(daemon, client):
         with deadline(20) as late:
             while client.state().phase == "running" and not late():
                 daemon.call(lambda: daemon.server.publish_frame("camera", noise))
-                assert slowest_answer(client, 0.05) < 0.5
+                assert slowest_answer(client, 0.05) < 2
         thread.join(10)
         assert not thread.is_alive()
     assert [event.seq for event in events] == list(range(1, 304))
@@ -99,7 +99,7 @@ def test_a_client_frozen_before_it_read_its_answers_is_given_up(daemon, client):
     """Ten megabytes wait for it: its link is closed after half a second."""
     store_large_calibration(daemon)
     with frozen_watcher(daemon.endpoint, questions=50):
-        assert slowest_answer(client, 3.0) < 1.5
+        assert slowest_answer(client, 3.0) < 2.5
         with deadline(10) as late:
             while daemon.server._answers and not late():
                 time.sleep(0.05)
@@ -136,7 +136,7 @@ def test_a_watcher_outlives_the_daemon(endpoint, tmp_path):
         while not isinstance(update := next(updates), Link):
             pass
         assert update == Link(alive=False, boot=boot)
-        assert time.monotonic() - killed < 1.0
+        assert time.monotonic() - killed < 2
         with program(*serve):
             while not isinstance(update := next(updates), Link) and not late():
                 pass

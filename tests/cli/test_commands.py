@@ -116,7 +116,7 @@ def test_the_same_request_id_does_not_run_twice(cellctl):
     first = cellctl("run", "count", "--request-id", "shift-2-of-may", "--json").json
     again = cellctl("run", "count", "--request-id", "shift-2-of-may", "--json")
     assert again.json["run_id"] == first["run_id"]
-    assert "taken before" in again.err
+    assert "was started before" in again.err
     assert len(cellctl("runs", "--json").json["runs"]) == 1
 
 
@@ -198,7 +198,7 @@ def test_names_of_procedures_are_completed(cellctl, monkeypatch, endpoint):
     monkeypatch.setenv("CELLCTL_CONNECT", free_endpoint())
     start = time.monotonic()
     assert _complete("") == []
-    assert time.monotonic() - start < 1
+    assert time.monotonic() - start < 1.8
 
 
 def test_nobody_listens(offline, endpoint):
