@@ -63,12 +63,12 @@ class Client:
         self.endpoint = endpoint
         self.label = (label or _who())[:64]
         self._wanted = cell
-        self._security = settings
+        self._settings = settings
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as opening:
-            session = opening.enter_context(open_connected(self.endpoint, self._security))
+            session = opening.enter_context(open_connected(self.endpoint, self._settings))
             self.keys = Keys(self._wanted or only_cell(session, self.endpoint))
             self._queries = Queries(session, self.keys, self.endpoint)
             self._session = session

@@ -67,7 +67,7 @@ class Server:
         self._keys = Keys(cell_id)
         self._live = self._keys.live(boot)
         self._robot = robot
-        self._security = settings
+        self._settings = settings
         self._slots = threading.BoundedSemaphore(MAX_WAITING)
         self._answers: set[asyncio.Task[None]] = set()
         self._open = False
@@ -85,7 +85,7 @@ class Server:
         Raises BadInput when the endpoint is malformed or taken.
         """
         self._loop = asyncio.get_running_loop()
-        self._session = await asyncio.to_thread(open_listening, self._endpoint, self._security)
+        self._session = await asyncio.to_thread(open_listening, self._endpoint, self._settings)
         self._replies = ThreadPoolExecutor(1, "cellctl-bus-reply")
         self._open = True
         self._publications = Publications(self._session, self._keys, self._engine, self._robot)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import typer
 
-from cellctl.cli import hosting, offline, reading, running
+from cellctl.cli import boards, hosting, offline, reading, running
 from cellctl.cli.output import note, report
 from cellctl.errors import BadInput, CellctlError
 
@@ -39,6 +39,7 @@ for command in (
     hosting.demo,
 ):
     app.command()(command)
+app.add_typer(boards.app, name="board")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
