@@ -74,6 +74,7 @@ class ActiveRun:
         self._run = Run(record, self, cell.solver, calibration=calibration)
         self._asking = asyncio.Lock()
         self._answer: asyncio.Future[str] | None = None
+        self._task: asyncio.Task[Result] | None = None
         self._stop: _Stop | None = None
         self._stop_asked = asyncio.Event()
         self._stopping = False
@@ -90,6 +91,8 @@ class ActiveRun:
             return False
         self._stop = _Stop(status, reason)
         self._stop_asked.set()
+        if self._task is not None:
+            self._task.cancel()
         self._enter_stopping()
         return True
 
@@ -145,6 +148,7 @@ class ActiveRun:
     async def ask(self, text: str, choices: Sequence[str]) -> str:
         async with self._asking:
             entry = await self.record.append("question", text=text, choices=list(choices))
+            self.check()
             number = entry.n
             self._answer = asyncio.get_running_loop().create_future()
             self.question = Question(id=number, text=text, choices=list(choices))
@@ -184,6 +188,7 @@ class ActiveRun:
     async def _outcome(self) -> dict[str, Any] | Ending:
         """The result as it was journalled, or how the procedure ended without one."""
         task = asyncio.create_task(self._perform(), name=f"procedure {self.procedure.name}")
+        self._task = task
         asked = asyncio.create_task(self._stop_asked.wait(), name="stop asked")
         try:
             await asyncio.wait({task, asked}, return_when=asyncio.FIRST_COMPLETED)
@@ -216,9 +221,8 @@ class ActiveRun:
         return entry.data
 
     async def _unwind(self, task: asyncio.Task[Result], stop: _Stop) -> Ending:
-        """Cancel the procedure and wait for its end; what it came to no longer counts."""
+        """Wait for the end of the procedure that `stop` cancelled; its result no longer counts."""
         ending = Ending(stop.status, stop.reason)
-        task.cancel()
         await asyncio.wait({task}, timeout=self._limits.unwind_s)
         if not task.done():
             ending = _with_fault(ending, await self._halt(clean=False))

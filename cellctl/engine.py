@@ -207,7 +207,14 @@ class Engine:
             provenance = await look_at(self._cell, self._limits.identity_s)
             provenance.require_same(header)
             calibration = await self._calibration(header.active_calibration)
-            record = await self._reopen(request, provenance.devices)
+            record = await self._store.reopen(
+                request.run_id,
+                "resumed",
+                boot=self.boot,
+                client=request.client,
+                versions=versions(),
+                devices=provenance.devices,
+            )
             return self._launch(record, procedure, calibration, "resumed")
 
     async def cancel(self, request: CancelRequest) -> Accepted:
@@ -265,22 +272,11 @@ class Engine:
         self._phase = transition(self._phase, event)
         self._bulletin.publish(self.state())
 
-    async def _reopen(self, request: ResumeRequest, devices: Mapping[str, Any]) -> RunRecord:
-        record = await self._store.reopen(request.run_id)
-        resumed = {"boot": self.boot, "client": request.client, "versions": versions()}
-        try:
-            await record.append("resumed", **resumed, devices=devices)
-        except BaseException:
-            await record.close()
-            raise
-        return record
-
     async def _calibration(self, calibration_id: str | None) -> Mapping[str, Any] | None:
         if calibration_id is None:
             return None
-        calibration: Mapping[str, Any]
-        calibration = (await self.calibration(calibration_id)).document["calibration"]
-        return calibration
+        document = (await self.calibration(calibration_id)).document
+        return dict(document["calibration"])
 
     def _launch(
         self,
@@ -367,8 +363,7 @@ class Engine:
     async def _abandon(self, run_id: str, client: str) -> Accepted:
         status = self._store.folder(run_id).standing.status
         if status == "interrupted":
-            async with self._store.reopened(run_id) as record:
-                await record.append("abandoned", error=f"abandoned by {client}")
+            await self._store.note(run_id, "abandoned", error=f"abandoned by {client}")
             self._bulletin.event("ended", run_id, status="abandoned")
             return Accepted(message="the run is abandoned", run_id=run_id)
         if status in ("cancelled", "abandoned"):
@@ -383,8 +378,7 @@ class Engine:
         if self._hung is not None and not self._hung.done():
             raise DeviceFault(f"{self._fault}; it cannot be acknowledged before that")
         for run_id in self._unacknowledged():
-            async with self._store.reopened(run_id) as record:
-                await record.append("acknowledged", client=client)
+            await self._store.note(run_id, "acknowledged", client=client)
         self._fault = None
         self._fire("ack")
         self._bulletin.event("acknowledged", client=client)

@@ -17,7 +17,7 @@ LIVE: frozenset[RunStatus] = frozenset({"running", "waiting"})
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a run stands after its newest event. `counts` are samples by step."""
+    """Where a run stands after its newest event. `counts` are samples by `<scope>/<step>`."""
 
     status: RunStatus = "running"
     verdict: Verdict | None = None
@@ -46,16 +46,12 @@ def _question(standing: Standing, entry: Entry) -> Standing:
 
 
 def _step(standing: Standing, entry: Entry) -> Standing:
-    return replace(standing, step=_step_of(entry), step_total=entry.data["total"])
+    return replace(standing, step=entry.at, step_total=entry.data["total"])
 
 
 def _sample(standing: Standing, entry: Entry) -> Standing:
-    step = _step_of(entry)
-    return replace(standing, counts={**standing.counts, step: standing.counts.get(step, 0) + 1})
-
-
-def _step_of(entry: Entry) -> str:
-    return address(entry.data["scope"], entry.data["step"])
+    counts = {**standing.counts, entry.at: standing.counts.get(entry.at, 0) + 1}
+    return replace(standing, counts=counts)
 
 
 def _end(status: RunStatus) -> Callable[[Standing, Entry], Standing]:
@@ -65,7 +61,7 @@ def _end(status: RunStatus) -> Callable[[Standing, Entry], Standing]:
             standing,
             status=status,
             error=data.get("error"),
-            fault=data.get("fault"),
+            fault=data.get("fault") or standing.fault,
             ended=entry.time,
             question=None,
             verdict=data.get("verdict"),
@@ -127,36 +123,45 @@ class Sample:
 
 
 class History:
-    """The entries of one run, to be asked. `entries` may still grow."""
+    """The events of one run, to be asked. More may be added, by one thread."""
 
     def __init__(self, directory: Path, entries: Sequence[Entry]) -> None:
         self._directory = directory
-        self._entries = entries
+        self._samples: dict[str, dict[str, Sample]] = {}
+        self._records: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        self._result: dict[str, Any] | None = None
+        for entry in entries:
+            self.add(entry)
 
-    def samples(self, scope: str, step: str) -> dict[str, Sample]:
-        """The samples of one step by their keys, in the order in which they were taken."""
-        return {
-            entry.data["key"]: self._sample(entry)
-            for entry in self._of("sample", scope)
-            if entry.data["step"] == step
-        }
+    def add(self, entry: Entry) -> None:
+        """Take in one more event."""
+        data = entry.data
+        if entry.kind == "sample":
+            self._samples.setdefault(entry.at, {})[data["key"]] = self._sample(data)
+        elif entry.kind == "record":
+            self._records.setdefault((entry.at, data["name"]), []).append(data["data"])
+        elif entry.kind == "result":
+            self._result = data
 
-    def _sample(self, entry: Entry) -> Sample:
-        images = {
-            name: Picture(self._directory / named["file"], named["sha256"])
-            for name, named in entry.data["images"].items()
-        }
-        return Sample(entry.data["key"], entry.data["data"], images)
+    def samples(self, step: str) -> dict[str, Sample]:
+        """The samples of a step, as `<scope>/<step>`, by key and in the order they were taken."""
+        return dict(self._samples.get(step, {}))
+
+    def steps(self) -> dict[str, dict[str, Sample]]:
+        """All samples, by step and key."""
+        return {step: dict(samples) for step, samples in self._samples.items()}
 
     def records(self, scope: str, name: str) -> list[dict[str, Any]]:
-        """What was recorded as `name`, oldest first."""
-        found = self._of("record", scope)
-        return [entry.data["data"] for entry in found if entry.data["name"] == name]
+        """What was recorded as `name` in a scope, oldest first."""
+        return list(self._records.get((scope, name), []))
 
     def result(self) -> dict[str, Any] | None:
         """The result that the procedure came to, if it did."""
-        found = [entry.data for entry in self._entries if entry.kind == "result"]
-        return found[-1] if found else None
+        return self._result
 
-    def _of(self, kind: str, scope: str) -> list[Entry]:
-        return [e for e in self._entries if e.kind == kind and e.data["scope"] == scope]
+    def _sample(self, data: dict[str, Any]) -> Sample:
+        images = {
+            name: Picture(self._directory / named["file"], named["sha256"])
+            for name, named in data["images"].items()
+        }
+        return Sample(data["key"], data["data"], images)

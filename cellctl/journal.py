@@ -1,8 +1,10 @@
 """A run's journal: one fsynced line an event, numbered and checksummed.
 
-    {"n": 3, "t": "2026-01-31T06:15:00.250000Z", "kind": "sample", "data": {...}, "crc": "8d2f01c4"}
+    {"n": 3, "t": "2026-01-31T06:15:00.250000Z", "kind": "sample", "at": "full/hand-eye/collect",
+     "data": {...}, "crc": "8d2f01c4"}                                             (on one line)
 
-`crc` is the CRC-32 of the line without that member. A line is one write that ends with its
+`at` is the place in the run that the event belongs to, and may be empty. `crc` is the CRC-32 of
+the line without that member. A line is one write that ends with its
 newline, and JSON never holds a newline inside: bytes after the last newline are an append that a
 crash cut short and that nobody was told to be safe. They are moved aside, never guessed at. A
 line that is complete but damaged is an error, and the others stay readable.
@@ -11,6 +13,7 @@ line that is complete but damaged is an error, and the others stay readable.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import re
@@ -32,17 +35,29 @@ from cellctl.files import (
 
 SCHEMA = Schema("cellctl-journal", 1)
 HEADER = "journal"
-SUFFIX = re.compile(rb', "crc": "([0-9a-f]{8})"\}$')
+HEAD = re.compile(
+    rb'\{"n": (\d{1,9}), "t": "([0-9TZ:.-]+)", "kind": "([a-z]+)", "at": "([\w/-]*)", "data": \{'
+)
+TAIL = re.compile(rb'\}, "crc": "([0-9a-f]{8})"\}')
+TAIL_BYTES = len('}, "crc": "00000000"}')
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One event: running number from 0 (the header), UTC time, kind, and what belongs to it."""
+    """One event: running number from 0 (the header), UTC time, kind, place, and what belongs to
+    it as JSON. That is decoded when it is asked for: hundreds of runs are looked through when a
+    daemon starts, and few of their samples are."""
 
     n: int
     time: str
     kind: str
-    data: dict[str, Any]
+    at: str
+    body: bytes
+
+    @functools.cached_property
+    def data(self) -> dict[str, Any]:
+        decoded: dict[str, Any] = json.loads(self.body)
+        return decoded
 
 
 @dataclass(frozen=True)
@@ -61,23 +76,25 @@ class Reading:
         return self.entries
 
 
-def encode(entry: Entry, where: str) -> bytes:
-    """A line, newline included. BadInput when `data` holds what JSON cannot."""
-    members = {"n": entry.n, "t": entry.time, "kind": entry.kind, "data": entry.data}
-    body = to_json(members, where)
-    return body[:-1] + b', "crc": "%08x"}\n' % zlib.crc32(body)
+def encode(entry: Entry) -> bytes:
+    """A line, newline included."""
+    head = f'{{"n": {entry.n}, "t": "{entry.time}", "kind": "{entry.kind}", "at": "{entry.at}"'
+    line = b'%s, "data": %s}' % (head.encode(), entry.body)
+    return b'%s, "crc": "%08x"}\n' % (line[:-1], zlib.crc32(line))
 
 
 def decode(line: bytes) -> Entry:
     """An entry from a line without its newline; ValueError says what is wrong with it."""
-    match = SUFFIX.search(line)
-    if match is None:
+    tail = TAIL.fullmatch(line, max(len(line) - TAIL_BYTES, 0))
+    if tail is None:
         raise ValueError("it does not end with a checksum")
-    body = line[: match.start()] + b"}"
-    if zlib.crc32(body) != int(match[1], 16):
+    if zlib.crc32(b"}", zlib.crc32(line[: tail.start() + 1])) != int(tail[1], 16):
         raise ValueError("its checksum does not match")
-    document = json.loads(body)
-    return Entry(document["n"], document["t"], document["kind"], document["data"])
+    head = HEAD.match(line)
+    if head is None:
+        raise ValueError("it is not an event of this journal's version")
+    number, time, kind, at = (part.decode() for part in head.groups())
+    return Entry(int(number), time, kind, at, line[head.end() - 1 : tail.start() + 1])
 
 
 def read(path: Path) -> Reading:
@@ -105,7 +122,7 @@ def _entries(lines: list[bytes], path: Path) -> tuple[list[Entry], list[str]]:
     for number, line in enumerate(lines, start=1):
         try:
             entry = decode(line)
-        except (ValueError, KeyError, TypeError) as error:
+        except ValueError as error:
             damage.append(f"{path} line {number} is damaged: {error}")
             expected += 1
             continue
@@ -130,8 +147,8 @@ class Journal:
     @classmethod
     def create(cls, path: Path, run_id: str) -> Journal:
         """Begin a journal with its header."""
-        header = Entry(0, utc_now(), HEADER, {"schema": SCHEMA.tag, "run_id": run_id})
-        write_atomically(path, encode(header, str(path)))
+        body = to_json({"schema": SCHEMA.tag, "run_id": run_id}, str(path))
+        write_atomically(path, encode(Entry(0, utc_now(), HEADER, "", body)))
         return cls(path, count=1)
 
     @classmethod
@@ -146,13 +163,18 @@ class Journal:
             _move_aside(path, reading.torn, len(entries))
         return cls(path, count=len(entries)), entries
 
-    def append(self, kind: str, data: dict[str, Any]) -> Entry:
-        """Append and fsync; returns the entry as a reader will see it.
+    def append(self, kind: str, data: dict[str, Any], at: str = "") -> Entry:
+        """Append and fsync; returns the entry as a reader will see it. `kind` is a word of small
+        letters, `at` a path of names (letters, digits, `_`, `-`).
 
         Raises BadInput when `data` cannot be JSON, and StorageFault when the disk refuses: the
         line is then taken back and the journal accepts no other until it is opened again.
         """
-        line = encode(Entry(self._count, utc_now(), kind, data), f"{kind} of {self._path.parent}")
+        where = f"{self._path.parent}: {kind} {at}".rstrip()
+        entry = Entry(self._count, utc_now(), kind, at, to_json(data, where))
+        line = encode(entry)
+        if HEAD.match(line) is None:
+            raise ValueError(f"{where}: a kind and a place are made of plain names")
         if self._failure is not None:
             raise StorageFault(self._failure.message, **self._failure.details)
         try:
@@ -165,7 +187,7 @@ class Journal:
             raise
         self._count += 1
         self._size += len(line)
-        return decode(line[:-1])
+        return entry
 
     def _take_back(self) -> None:
         with contextlib.suppress(OSError):  # what stays is a torn line, which readers know

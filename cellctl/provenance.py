@@ -89,16 +89,17 @@ class Provenance:
 
 
 async def look_at(cell: Cell, timeout_s: float) -> Provenance:
-    """Ask the devices who they are. DeviceFault names one that does not answer in time."""
+    """Ask the devices who they are. DeviceFault names one that has not answered by then."""
     devices: dict[str, Robot | Camera | Projector]
     devices = {"robot": cell.robot, "camera": cell.camera, "projector": cell.projector}
-    found = {}
-    for name, device in devices.items():
-        try:
-            async with asyncio.timeout(timeout_s):
+    found: dict[str, dict[str, str]] = {}
+    try:
+        async with asyncio.timeout(timeout_s):
+            for name, device in devices.items():
                 found[name] = asdict(await device.identity())
-        except TimeoutError:
-            raise DeviceFault(f"the {name} did not say who it is within {timeout_s:g} s") from None
+    except TimeoutError:
+        silent = next(name for name in devices if name not in found)
+        raise DeviceFault(f"the {silent} did not say who it is within {timeout_s:g} s") from None
     return Provenance(cell.config.model_dump(mode="json"), found)
 
 

@@ -153,9 +153,8 @@ class Run:
     async def step(self, name: str, total: int = 0) -> None:
         """Begin a step of `total` parts; what is sampled from here on belongs to it."""
         self._step, self._total = _named("step", name), total
-        place = {"scope": self._scope, "step": name}
-        await self._record.append("step", **place, total=total)
-        self._host.tell("step", **place, total=total)
+        await self._record.append("step", at=address(self._scope, name), total=total)
+        self._host.tell("step", scope=self._scope, step=name, total=total)
         self.progress(len(self.samples()))
 
     def progress(self, done: int, text: str = "") -> None:
@@ -172,7 +171,7 @@ class Run:
 
     async def record(self, kind: str, /, **data: Any) -> None:
         """Journal something that `recall` finds again, such as a view that was rejected."""
-        await self._record.append("record", scope=self._scope, name=kind, data=data)
+        await self._record.append("record", at=self._scope, name=kind, data=data)
         self._host.tell("record", scope=self._scope, name=kind)
 
     def recall(self, kind: str) -> dict[str, Any] | None:
@@ -196,14 +195,14 @@ class Run:
             _named("sample", name)
         if key in self.samples():
             raise ValueError(f"{self._address(key)}: this sample was taken already")
-        place = {"scope": self._scope, "step": self._current_step()}
-        await self._record.append_sample({**place, "key": key}, dict(data), images)
-        self._host.tell("sample", **place, key=key)
+        step = self._current_step()
+        await self._record.append_sample(address(self._scope, step), key, data, images)
+        self._host.tell("sample", scope=self._scope, step=step, key=key)
         return self.samples()[key]
 
     def samples(self, step: str | None = None) -> dict[str, Sample]:
         """The samples of a step (None: the current one) by key, in the order they were taken."""
-        return self._record.history.samples(self._scope, step or self._current_step())
+        return self._record.history.samples(address(self._scope, step or self._current_step()))
 
     @contextlib.asynccontextmanager
     async def taking(self, key: str) -> AsyncIterator[None]:

@@ -14,7 +14,7 @@ import contextlib
 import fcntl
 import os
 import shutil
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -63,7 +63,6 @@ class RunRecord:
         self.folder = folder
         self.history = History(folder.directory, entries)
         self._journal = journal
-        self._entries = entries
         self._in_order = in_order
 
     @property
@@ -74,16 +73,15 @@ class RunRecord:
     def directory(self) -> Path:
         return self.folder.directory
 
-    async def append(self, kind: str, /, **data: Any) -> Entry:
+    async def append(self, kind: str, /, at: str = "", **data: Any) -> Entry:
         """Journal an event. Raises as `Journal.append`."""
-        return await self._in_order(self._append, kind, data)
+        return await self._in_order(self._append, kind, data, at)
 
     async def append_sample(
-        self, address: Mapping[str, str], data: Any, images: Mapping[str, Image]
+        self, at: str, key: str, data: Mapping[str, Any], images: Mapping[str, Image]
     ) -> Entry:
-        """Write the images, then journal the sample that names them. `address` has `scope`,
-        `step` and `key`, made of characters that a file name may hold."""
-        return await self._in_order(self._append_sample, address, data, images)
+        """Write the images, then journal the sample that names them. `at` is its step."""
+        return await self._in_order(self._append_sample, at, key, dict(data), images)
 
     async def write_result(self, content: dict[str, Any]) -> None:
         """Write result.json."""
@@ -96,22 +94,22 @@ class RunRecord:
     async def close(self) -> None:
         await self._in_order(self._journal.close)
 
-    def _append(self, kind: str, data: dict[str, Any]) -> Entry:
-        entry = self._journal.append(kind, data)
-        self._entries.append(entry)
+    def _append(self, kind: str, data: dict[str, Any], at: str) -> Entry:
+        entry = self._journal.append(kind, data, at)
+        self.history.add(entry)
         self.folder.standing = advance(self.folder.standing, entry)
         return entry
 
     def _append_sample(
-        self, address: Mapping[str, str], data: Any, images: Mapping[str, Image]
+        self, at: str, key: str, data: dict[str, Any], images: Mapping[str, Image]
     ) -> Entry:
-        stem = ".".join(part for part in "/".join(address.values()).split("/") if part)
+        stem = f"{at}/{key}".replace("/", ".")
         named = {}
         for name, image in images.items():
             picture = write_picture(self.directory / "images" / f"{stem}.{name}.png", image)
             file = picture.path.relative_to(self.directory).as_posix()
             named[name] = {"file": file, "sha256": picture.sha256}
-        return self._append("sample", {**address, "data": data, "images": named})
+        return self._append("sample", {"key": key, "data": data, "images": named}, at)
 
 
 class Store:
@@ -163,20 +161,21 @@ class Store:
         self._requests[header.request_id] = header.run_id
         return RunRecord(folder, journal, entries, self.in_order)
 
-    async def reopen(self, run_id: str) -> RunRecord:
-        """An existing run, to append to. BadInput when its journal is damaged."""
+    async def reopen(self, run_id: str, kind: str, /, **data: Any) -> RunRecord:
+        """Open an existing run and journal an event. BadInput when its journal is damaged."""
         folder = self.folder(run_id)
         journal, entries = await self.in_order(Journal.open, folder.directory / JOURNAL)
-        return RunRecord(folder, journal, entries, self.in_order)
-
-    @contextlib.asynccontextmanager
-    async def reopened(self, run_id: str) -> AsyncIterator[RunRecord]:
-        """As `reopen`, closed at the end."""
-        record = await self.reopen(run_id)
+        record = RunRecord(folder, journal, entries, self.in_order)
         try:
-            yield record
-        finally:
+            await record.append(kind, **data)
+        except BaseException:
             await record.close()
+            raise
+        return record
+
+    async def note(self, run_id: str, kind: str, /, **data: Any) -> None:
+        """Journal one event of a run that is not open."""
+        await (await self.reopen(run_id, kind, **data)).close()
 
     def folder(self, run_id: str) -> RunFolder:
         """One run; NotFound names the newest ones."""

@@ -24,9 +24,10 @@ from typing import IO, Any, Self, cast
 import structlog
 
 from cellctl.errors import CellctlError, DeviceFault
-from cellctl.worker_child import Broke, Parts, Raised, pack, receive, send, unpack
+from cellctl.worker_child import COMMAND, Broke, Parts, Raised, pack, receive, send, unpack
 
 START_S = 30.0
+EXIT_S = 2.0
 REAP_S = 5.0
 DEATHS_ALLOWED = 5
 DEATHS_WINDOW_S = 60.0
@@ -87,7 +88,7 @@ class Child:
         exception of it; DeviceFault, which names function and cause, when it took longer than
         `timeout_s` or its process died. Cancelling the call kills the process.
         """
-        what = f"{function.__module__}.{function.__qualname__}"
+        what = f"{function.__module__}.{getattr(function, '__qualname__', function)}"
         if function.__module__ == "__main__":
             raise ValueError(f"{what}: a child can only import functions of a module")
         request = pack((function, args))
@@ -118,11 +119,8 @@ class Child:
         return self._process
 
     async def _launch(self) -> _Process:
-        loop = asyncio.get_running_loop()
         started = time.monotonic()
-        self._process = process = await loop.run_in_executor(
-            self._thread, _Process, self._name, self._preload
-        )
+        self._process = process = await self._spawn()
         await self._within(START_S, process, process.wait_ready, what="its start")
         log.info(
             "child process is ready",
@@ -131,6 +129,19 @@ class Child:
             seconds=round(time.monotonic() - started, 3),
         )
         return process
+
+    async def _spawn(self) -> _Process:
+        """Start a process, which takes milliseconds; it is not lost when that is cancelled."""
+        loop = asyncio.get_running_loop()
+        future = loop.run_in_executor(self._thread, _Process, self._name, self._preload)
+        try:
+            await _finish(future)
+        except asyncio.CancelledError:
+            if future.exception() is None:
+                self._process = future.result()
+                await self._discard()
+            raise
+        return future.result()
 
     async def _within(
         self,
@@ -161,15 +172,16 @@ class Child:
             raise await self._fault(process, what) from None
 
     async def _fault(self, process: _Process, what: str) -> DeviceFault:
+        """What to raise when the process hung up: how it ended, not that it was reaped."""
+        loop = asyncio.get_running_loop()
+        death = await loop.run_in_executor(self._thread, process.last_breath)
         await self._discard()
         if self._closed:
             return DeviceFault(f"process {self._name!r} was closed during {what}")
         self._deaths.append(time.monotonic())
         last = f"; its last words: {process.last_line}" if process.last_line else ""
         return DeviceFault(
-            f"process {self._name!r} {process.death()} during {what}{last}",
-            function=what,
-            death=process.death(),
+            f"process {self._name!r} {death} during {what}{last}", function=what, death=death
         )
 
     async def _abandon(self, future: asyncio.Future[Any]) -> None:
@@ -233,7 +245,7 @@ class _Process:
     """One process of a Child. All but `kill` and `death` block; one thread owns them."""
 
     def __init__(self, name: str, preload: Sequence[str]) -> None:
-        command = [sys.executable, "-P", "-X", "faulthandler", "-m", "cellctl.worker_child"]
+        command = [sys.executable, "-P", "-X", "faulthandler", "-c", COMMAND]
         path = os.pathsep.join(entry or str(Path.cwd()) for entry in sys.path)
         try:
             self._popen = subprocess.Popen(
@@ -278,6 +290,12 @@ class _Process:
         if code is None:
             return ""
         return f"died by {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
+
+    def last_breath(self) -> str:
+        """As `death`, of a process that hung up and so is about to end by itself."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._popen.wait(EXIT_S)
+        return self.death() or "hung up without ending"
 
     def kill(self) -> None:
         """SIGKILL to it and to what it may have started; harmless when it is gone."""

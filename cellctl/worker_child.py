@@ -1,7 +1,7 @@
 """The far side of `worker.Child`: a process that evaluates pure functions, one at a time.
 
-Started as `python -m cellctl.worker_child PARENT_PID [MODULE...]`; the modules are imported before
-it says that it is ready. Requests come in on stdin and replies leave on what was stdout; whatever
+Started as `python -c COMMAND PARENT_PID [MODULE...]`; the modules are imported before it says that
+it is ready. Requests come in on stdin and replies leave on what was stdout; whatever
 else is printed goes to stderr. It ends with its parent: at the end of its stdin, and on Linux by
 a signal too, for functions that hold the interpreter's lock.
 
@@ -26,6 +26,9 @@ from queue import SimpleQueue
 from typing import IO, Any
 
 from cellctl.errors import CellctlError
+
+COMMAND = "from cellctl.worker_child import main; main()"
+"""Not `-m`: the classes below must have the same module name on both sides."""
 
 PR_SET_PDEATHSIG = 1
 Parts = list[memoryview]
@@ -139,8 +142,8 @@ def _listen(requests: BufferedReader, queue: SimpleQueue[Parts]) -> None:
         os._exit(0)
 
 
-def main(arguments: list[str]) -> None:
-    parent, *modules = arguments
+def main() -> None:
+    parent, *modules = sys.argv[1:]
     _end_with(int(parent))
     requests, replies = _claim_pipes()
     queue: SimpleQueue[Parts] = SimpleQueue()
@@ -150,7 +153,3 @@ def main(arguments: list[str]) -> None:
     send(replies, pack(Returned(None)))
     while True:
         send(replies, evaluate(queue.get()))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
