@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from cellctl.bus.session import DEFAULT_ENDPOINT
 from cellctl.cli.boards import OPTIONS
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_a_board_is_made(offline, tmp_path):
@@ -82,3 +87,11 @@ def test_help_names_every_command(offline):
     assert said.code == 0
     for command in COMMANDS:
         assert f"\n  {command} " in said.out
+
+
+def test_check_config_of_the_cell_that_is_shipped(offline):
+    said = offline("check-config", str(ROOT / "config" / "sim-cr.toml"), "--json")
+    assert said.code == 0
+    assert said.json["valid"]
+    assert (said.json["cell"], said.json["arm"]) == ("sim-cr", "ur5")
+    assert said.json["listen"] == DEFAULT_ENDPOINT
