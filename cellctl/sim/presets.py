@@ -67,10 +67,12 @@ class ProjectorPreset:
 
 @dataclass(frozen=True)
 class TablePreset:
-    """The table, and the area on it that is drawn in (x, y extents in the world frame)."""
+    """The table: centre of the lit area, the area on it that is drawn in, and the table top
+    around the same centre (all extents along the world's x and y)."""
 
     centre_m: tuple[float, float, float]
     area_m: tuple[float, float]
+    top_m: tuple[float, float]
     tilt_sigma_rad: float = 1.5e-3
     bow_m: float = 1.0e-3
     bow_off_centre: float = 0.15
@@ -103,10 +105,13 @@ class Preset:
     projector: ProjectorPreset
     table: TablePreset
     boards: BoardPreset
+    home_deg: tuple[float, float, float, float, float, float]
     pen_sigma_m: float = 0.5e-3
     pen_slip_sigma_m: float = 0.15e-3
     tape_off_m: float = 0.10
     tape_off_deg: float = 10.0
+    body_radius_m: float = 0.05
+    """Camera and projector are bodies of this radius around their optical centres."""
 
 
 CR = Preset(
@@ -122,8 +127,9 @@ CR = Preset(
         yaw_deg=0.0,
         factory_centre_off_px=2.0,
     ),
+    home_deg=(-190.0, -95.0, -70.0, -105.0, 90.0, -100.0),
     projector=ProjectorPreset(throw_ratio=1.55, distance_m=1.3, yaw_deg=0.0),
-    table=TablePreset(centre_m=(0.0, -0.44, 0.0), area_m=(0.670, 0.375)),
+    table=TablePreset(centre_m=(0.0, -0.44, 0.0), area_m=(0.670, 0.375), top_m=(1.70, 1.10)),
     boards=BoardPreset(
         inner_corners=(9, 6),
         square_m=0.030,

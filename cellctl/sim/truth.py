@@ -17,7 +17,19 @@ from cellctl.sim.lens import Lens
 from cellctl.sim.presets import BoardPreset, CameraPreset, Preset, ProjectorPreset, TablePreset
 
 Rng = np.random.Generator
-STREAMS = ("arm", "camera", "projector", "table", "checkerboard", "markers", "pen", "tape", "light")
+STREAMS = (
+    "arm",
+    "camera",
+    "projector",
+    "table",
+    "checkerboard",
+    "markers",
+    "pen",
+    "tape",
+    "touch",
+    "ring",
+)
+RING_HZ = (8.0, 12.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +41,7 @@ class Table:
     half_lit: Array  # (2,) metres
     bow: float
     off: Array  # (2,) in units of the half extents
+    half_top: Array  # (2,) metres: the table top, of which light covers a part
 
     def height(self, xy: Array) -> Array:
         """Height of the surface (...,) above the table's plane at table xy (..., 2)."""
@@ -103,6 +116,7 @@ class Truth:
     boards: dict[str, Board]
     pen: Array  # true pen tip in the flange frame (3,)
     nominal_pen: Array  # as the config states it (3,)
+    ring_hz: float  # at which the arm rings when it has braked
 
     def light_lands(self, pixels: Array) -> Array:
         """World points (..., 3) on the table that projector pixels (..., 2) light."""
@@ -149,6 +163,7 @@ def draw(preset: Preset, seed: int) -> Truth:
         },
         pen=pen + rng["pen"].normal(0.0, preset.pen_sigma_m, 3),
         nominal_pen=pen,
+        ring_hz=float(rng["ring"].uniform(*RING_HZ)),
     )
 
 
@@ -208,7 +223,8 @@ def _table(preset: TablePreset, projector: ProjectorPreset, rng: Rng) -> Table:
     half = np.array([width, width * projector.size_px[1] / projector.size_px[0]]) / 2
     off = preset.bow_off_centre * rng.choice((-1.0, 1.0), 2)
     bow = preset.bow_m * float(rng.choice((-1.0, 1.0)))
-    return Table(Transform("world", "table", pose), half, bow, off)
+    turned = np.abs(turn[:2, :2].T) @ (np.array(preset.top_m) / 2)
+    return Table(Transform("world", "table", pose), half, bow, off, turned)
 
 
 def _board(name: str, preset: BoardPreset, rng: Rng) -> Board:

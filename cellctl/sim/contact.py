@@ -1,0 +1,131 @@
+"""When the arm, or what it carries, touches something: true hulls against the true cell.
+
+Hulls are sampled as balls: links along their axes, boards and tray on a grid. Links are not
+checked against each other, but what the bracket carries is checked against the links.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cellctl.geometry import Array
+from cellctl.sim.bodies import Body, bodies, plate_points
+from cellctl.sim.truth import Truth
+from cellctl.sim.view import Capsule, Plate
+
+SHEET_SPACING_M = 0.04
+SHEET_RADIUS_M = 0.002
+FOREARM = 3
+"""Links up to this DH frame are what the bracket could be swung into."""
+SWUNG = ("tray", "pen")
+"""What is checked against them; the boards lie on the tray."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Sample points (n, 3) of one body in its DH frame `frame`, and their radius."""
+
+    name: str
+    frame: int
+    points: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The smallest `gap` in metres (negative: they overlap), and between what."""
+
+    gap: float
+    between: tuple[str, str]
+
+
+class Obstacles:
+    """What the arm of one truth can touch."""
+
+    def __init__(self, truth: Truth) -> None:
+        self._truth = truth
+        self._balls = [_balls(body) for body in bodies(truth) if body.frame > 0]
+
+    def gaps(self, frames: Array) -> tuple[Array, list[tuple[str, str]]]:
+        """Gaps (n, pairs) at true link frames (n, 7, 4, 4), and the names of the pairs."""
+        columns, names = [], []
+        for balls in self._balls:
+            points = _moved(frames[:, balls.frame], balls.points)
+            for name, gap in self._around(points).items():
+                columns.append(gap - balls.radius)
+                names.append((balls.name, name))
+            if balls.name in SWUNG:
+                columns.append(self._to_links(points, frames) - balls.radius)
+                names.append((balls.name, "arm"))
+        return np.stack(columns, axis=1), names
+
+    def nearest(self, frames: Array) -> Contact:
+        """The smallest gap at one set of link frames (7, 4, 4)."""
+        gaps, names = self.gaps(frames[None])
+        pair = int(gaps[0].argmin())
+        return Contact(float(gaps[0, pair]), names[pair])
+
+    def _around(self, points: Array) -> dict[str, Array]:
+        """Gaps (n,) from points (n, k, 3) in the world to table, camera and projector."""
+        truth = self._truth
+        bodies_at = {"camera": truth.camera.pose, "projector": truth.projector.pose}
+        gaps = {
+            name: _distance(points, pose.translation).min(axis=1) - truth.preset.body_radius_m
+            for name, pose in bodies_at.items()
+        }
+        gaps["table"] = self._above_table(points).min(axis=1)
+        return gaps
+
+    def _above_table(self, points: Array) -> Array:
+        """Height (...,) over the table top; beside it, the distance to its upper edge."""
+        table = self._truth.table
+        places = table.pose.inverse().apply(points)
+        height = places[..., 2] - table.height(places[..., :2])
+        beside = np.linalg.norm(np.maximum(np.abs(places[..., :2]) - table.half_top, 0), axis=-1)
+        return np.where(beside > 0, np.hypot(beside, np.maximum(height, 0)), height)
+
+    def _to_links(self, points: Array, frames: Array) -> Array:
+        """Smallest gap (n,) from points (n, k, 3) to the links up to the forearm."""
+        gaps = np.full(len(points), np.inf)
+        for link in self._truth.arm.links:
+            if link.frame > FOREARM:
+                continue
+            ends = _moved(frames[:, link.frame], np.array([link.start, link.end]))
+            distance = _to_segments(points, ends[:, 0], ends[:, 1]).min(axis=1)
+            gaps = np.minimum(gaps, distance - link.radius)
+        return gaps
+
+
+def _balls(body: Body) -> Balls:
+    if isinstance(body.shape, Plate):
+        points = plate_points(body.shape, SHEET_SPACING_M)
+        return Balls(body.name, body.frame, points, SHEET_RADIUS_M)
+    return Balls(body.name, body.frame, _along(body.shape), body.shape.radius)
+
+
+def _along(capsule: Capsule) -> Array:
+    length = float(np.linalg.norm(capsule.end - capsule.start))
+    steps = np.linspace(0.0, 1.0, 2 + int(length / max(capsule.radius, 0.01)))
+    return capsule.start + steps[:, None] * (capsule.end - capsule.start)
+
+
+def _moved(poses: Array, points: Array) -> Array:
+    """(n, k, 3) of points (k, 3) under poses (n, 4, 4)."""
+    return points @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+
+
+def _distance(points: Array, place: Array) -> Array:
+    away = points - place
+    return np.sqrt(np.einsum("nkd,nkd->nk", away, away))
+
+
+def _to_segments(points: Array, starts: Array, ends: Array) -> Array:
+    """Distances (n, k) of points (n, k, 3) from one segment each, ends (n, 3)."""
+    axes, away = ends - starts, points - starts[:, None]
+    square = np.maximum((axes**2).sum(-1), 1e-12)[:, None]
+    along = np.einsum("nkd,nd->nk", away, axes)
+    nearest = np.clip(along / square, 0.0, 1.0)
+    distance = np.einsum("nkd,nkd->nk", away, away) + nearest * (nearest * square - 2 * along)
+    return np.sqrt(np.maximum(distance, 0.0))
