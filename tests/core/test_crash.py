@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from cellctl.history import History
-from cellctl.journal import read
+from cellctl.store.history import History
+from cellctl.store.journal import read
 from tests.core.processes import alive, python
 
 KILLS = int(os.environ.get("CELLCTL_SOAK", "12"))

@@ -8,8 +8,8 @@ import json
 import pytest
 import structlog
 
-from cellctl.bulletin import KEPT, Bulletin
-from cellctl.engine import TRANSITIONS, IllegalTransition, transition
+from cellctl.engine.bulletin import KEPT, Bulletin
+from cellctl.engine.engine import TRANSITIONS, IllegalTransition, transition
 from cellctl.errors import BadInput, Busy, DeviceFault, NotEnabled, NotFound
 from cellctl.messages import Event, Phase, Progress, PromoteRequest, RunRequest, State
 from cellctl.permission import enable

@@ -18,17 +18,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cellctl.active_run import Limits
-from cellctl.bulletin import Published
 from cellctl.cell import Cell, Solver
 from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
 from cellctl.drivers.base import Path as Joints
 from cellctl.engine import Engine
+from cellctl.engine.active_run import Limits
+from cellctl.engine.bulletin import Published
 from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotEnabled
 from cellctl.geometry import Transform
-from cellctl.journal import Entry, read
 from cellctl.messages import (
     Accepted,
     AckRequest,
@@ -43,7 +42,8 @@ from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
 from cellctl.store import Store
-from cellctl.worker import Child
+from cellctl.store.journal import Entry, read
+from cellctl.worker.child import Child
 from tests import cells
 from tests.core import functions
 
