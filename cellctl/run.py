@@ -41,6 +41,16 @@ class Result:
     data: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, Any] | None = None
 
+    @classmethod
+    def judged(
+        cls,
+        reasons: Sequence[str],
+        data: Mapping[str, Any],
+        calibration: Mapping[str, Any] | None = None,
+    ) -> Result:
+        """A failed one when there are reasons, else one that passes."""
+        return cls("fail" if reasons else "pass", reasons, data, calibration)
+
     def __post_init__(self) -> None:
         if self.verdict not in ("pass", "fail"):
             raise ValueError(f"a verdict is 'pass' or 'fail', not {self.verdict!r}")
@@ -52,8 +62,8 @@ class Result:
 class Procedure:
     """A procedure that can be asked for by name. `moves`: it needs the permission to move.
 
-    `conclude` is its pure part, from what was recorded in `steps` (names by scope) to the result:
-    `run` ends with it, and it is all that solving a run again needs.
+    `conclude` is its pure part, from what was recorded to the result: `run` ends with it, and it
+    is all that solving a run again needs.
     """
 
     name: str
@@ -62,7 +72,6 @@ class Procedure:
     moves: bool
     run: Callable[[Run, Cell, Any], Awaitable[Result]]
     conclude: Callable[[Any], Result] | None = None
-    steps: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def parse(self, given: Mapping[str, Any]) -> BaseModel:
         """The parameters, checked. BadInput names the one that is wrong, or unknown and nearest."""
@@ -209,6 +218,10 @@ class Run:
     def samples(self, step: str | None = None) -> dict[str, Sample]:
         """The samples of a step (None: the current one) by key, in the order they were taken."""
         return self._record.history.samples(address(self._scope, step or self._current_step()))
+
+    def all_samples(self) -> dict[str, dict[str, Sample]]:
+        """The samples of the whole run, by `<scope>/<step>` and key."""
+        return self._record.history.steps()
 
     @contextlib.asynccontextmanager
     async def taking(self, key: str) -> AsyncIterator[None]:

@@ -52,8 +52,15 @@ def print_table(title: str, rows: list[dict[str, Any]]) -> None:
     """Rows with the same keys; more than 40 are cut."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    for number, column in enumerate(columns):
-        table.add_column(column, overflow="fold", no_wrap=number == 0)  # names stay whole
+    for column in columns:
+        figures = all(isinstance(row.get(column), int | float | None) for row in rows)
+        width = max(len(column), *(len(short(row.get(column))) for row in rows))
+        table.add_column(
+            column,
+            overflow="fold",
+            justify="right" if figures else "left",
+            min_width=width if figures else None,
+        )
     for row in rows[:MAX_ROWS]:
         table.add_row(*(short(row.get(column)) for column in columns))
     out.print(table)

@@ -103,10 +103,10 @@ class Roadmap:
                 continue
             self.index[i] = self.tree.add(self.nodes[i], parent)
             del gap[i]
-            for k in gap:
+            for k, before in gap.items():
                 reach = float(np.abs(self.nodes[k] - self.nodes[i]).max())
-                if np.isfinite(gap[k]) or reach < CLUSTER_RAD:
-                    gap[k] = min(gap[k], reach)
+                if np.isfinite(before) or reach < CLUSTER_RAD:
+                    gap[k] = min(before, reach)
 
     def _gap(self, node: Array) -> float:
         return float(np.abs(np.array(self.tree.nodes) - node).max(axis=1).min())

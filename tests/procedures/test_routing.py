@@ -57,12 +57,21 @@ def test_roadmap_paths_are_allowed_and_reach_their_goals(guard, sides):
     free = {i for i in range(len(nodes)) if guard.free(nodes[i][None])[0]}
     assert set(road.index) <= free
     assert len(road.index) >= 5
-    here, at = sides[0], 0
-    for i in sorted(road.index):
-        path = road.path(here, at, road.index[i])
-        guard.check(here, path)
-        here, at = path.waypoints[-1], road.index[i]
-        assert np.array_equal(here, nodes[i])
+    for i, place in road.index.items():
+        path = road.path(sides[0], place)
+        guard.check(sides[0], path)
+        assert np.array_equal(path.waypoints[-1], nodes[i])
+
+
+def test_a_bridge_leads_to_a_cluster_out_of_reach(guard, sides):
+    rng = np.random.default_rng(2)
+    left, right = (side + rng.uniform(-0.1, 0.1, (5, 6)) for side in sides)
+    road = routing.Roadmap(guard, sides[0], np.vstack([left, right]))
+    assert not road.index.keys() & set(range(5, 10))
+    assert road.bridge()
+    beyond = road.index.keys() & set(range(5, 10))
+    assert beyond
+    guard.check(sides[0], road.path(sides[0], road.index[min(beyond)]))
 
 
 def test_nearest_first_is_greedy_and_complete():
