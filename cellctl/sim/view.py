@@ -23,6 +23,8 @@ from cellctl.sim.region import NOWHERE, Region
 TILE = 16
 NEAR_M = 0.01
 OUTSIDE = -1.0
+GRAZING = 1e-5
+"""Rays that rise less than this over a plane are taken to rise this much."""
 """What is nearer than this to a lens's plane is not seen."""
 GRID_STEP_PX = 32
 Normal = tuple[Array, Array, Array]
@@ -215,8 +217,9 @@ def tiled(picture: Array) -> Array:
 def on_plane(pose: Array, rays: Rays) -> tuple[Array, Array, Array]:
     """Where rays meet the plane z = 0 of `pose` (4, 4): x and y there, depth."""
     x_axis, y_axis, normal, origin = pose[:3].T
-    with np.errstate(divide="ignore"):
-        depth = np.float32(normal @ origin) / rays.dot(normal)
+    slope = rays.dot(normal)
+    np.copyto(slope, np.float32(GRAZING), where=np.abs(slope) < GRAZING)
+    depth = np.float32(normal @ origin) / slope
     x = depth * rays.dot(x_axis) - np.float32(x_axis @ origin)
     y = depth * rays.dot(y_axis) - np.float32(y_axis @ origin)
     return x, y, depth
