@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cellctl.arms import ArmModel
 from cellctl.clock import Clock
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Projector, Robot
+from cellctl.motion import Guard
 
 
 class Solver(Protocol):
@@ -20,10 +20,10 @@ class Solver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """`robot` is the guarded one: every path that reaches a driver has passed `motion.Guard`."""
+    """`robot` is the guarded one: every path that reaches a driver has passed `guard`."""
 
     config: CellConfig
-    arm: ArmModel
+    guard: Guard
     robot: Robot
     camera: Camera
     projector: Projector

@@ -68,6 +68,12 @@ class DeviceFault(CellctlError):
     code = "device_fault"
 
 
+class StorageFault(DeviceFault):
+    """The data directory cannot be written. What was journalled before stays as it is."""
+
+    code = "storage_fault"
+
+
 class MotionRefused(CellctlError):
     """The guard, or the controller, refuses a path. Nothing has moved."""
 
@@ -95,6 +101,7 @@ BY_CODE: dict[str, type[CellctlError]] = {
         Unreachable,
         NotFound,
         DeviceFault,
+        StorageFault,
         MotionRefused,
         SolveError,
     )

@@ -25,8 +25,7 @@ class Body:
     def world(self, frames: Array) -> Array:
         """Sphere centres (..., n, 3) for link frames (..., 7, 4, 4)."""
         pose = frames[..., self.frame, :, :]
-        turned = np.einsum("...ij,nj->...ni", pose[..., :3, :3], self.points)
-        return turned + pose[..., None, :3, 3]
+        return self.points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
 
 
 def capsule_body(name: str, capsule: Capsule) -> Body:

@@ -29,6 +29,9 @@ LAST_ARM_FRAME = 4
 base, and what the wrist carries, from three apart: nearer ones are joined and always near."""
 MAX_STEP_M = 0.01
 """No sphere moves further than this between two checked states of a path."""
+COARSE = 8
+PIECES = 8
+"""A joint line is cut into so many to find the speed of its fastest sphere."""
 STANDSTILL_S = 0.05
 
 
@@ -115,8 +118,9 @@ class Guard:
         )
 
     def allows(self, start: Array, path: Path) -> bool:
-        """Whether `check` would pass."""
-        return bool(self.free(self.sample(start, path)).all())
+        """Whether `check` would pass. Looks at a few states first: most refusals show there."""
+        joints = self.sample(start, path)
+        return bool(self.free(joints[::COARSE]).all() and self.free(joints).all())
 
     def sample(self, start: Array, path: Path) -> Array:
         """Joints (n, 6) along a path, so close that no sphere moves more than MAX_STEP_M."""
@@ -145,12 +149,11 @@ class Guard:
         return centres, np.concatenate([body.radii for body in chosen])
 
     def _travel(self, a: Array, b: Array) -> float:
-        """Upper estimate of how far any sphere travels on the joint line a-b: its longest chord
-        polyline over nine states."""
-        joints = a + (b - a) * np.linspace(0.0, 1.0, 9)[:, None]
+        """How far any sphere would travel on the joint line a-b at the fastest that any of them
+        moves anywhere on it (to within a few percent)."""
+        joints = a + (b - a) * np.linspace(0.0, 1.0, PIECES + 1)[:, None]
         centres, _ = self.spheres(joints)
-        lengths = np.linalg.norm(np.diff(centres, axis=0), axis=2).sum(axis=0)
-        return float(lengths.max())
+        return float(PIECES * np.linalg.norm(np.diff(centres, axis=0), axis=2).max())
 
     def _checks(self, joints: Array) -> Checks:
         """(reason, hit (n,)) of every rule for joints (n, 6)."""
@@ -158,40 +161,41 @@ class Guard:
         frames = self.arm.link_frames(joints)
         inside = self.arm.within_limits(joints, self.joint_margin)
         checks: Checks = [("a joint is at its limit", ~inside)]
-        for body in self._free_bodies:
-            checks += self._surroundings(body, body.world(frames))
-        for one, other in self._pairs:
-            gap = _gap(one.world(frames), one.radii, other.world(frames), other.radii)
-            checks.append((f"{one.name} and {other.name} meet", gap < 0.0))
+        centres = [body.world(frames) for body in self.bodies]
+        for body, spheres in zip(self.bodies, centres, strict=True):
+            if body.frame >= FIRST_FREE_FRAME:
+                checks += self._surroundings(body, spheres)
+        for i, j in self._pairs:
+            one, other = self.bodies[i], self.bodies[j]
+            meet = _meet(centres[i], one.radii, centres[j], other.radii)
+            checks.append((f"{one.name} and {other.name} meet", meet))
         return checks
 
     def _surroundings(self, body: Body, centres: Array) -> Checks:
         scene = self.scene
         reach = body.radii + (self.clearance if body.frame > FIRST_FREE_FRAME else 0.0)
-        over = (centres - reach[:, None] < scene.box_low) | (
-            centres + reach[:, None] > scene.box_high
-        )
-        low = centres[..., 2] - reach < scene.table_height
+        room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
+        height = centres[..., 2] - scene.table_height
         checks: Checks = [
-            (f"{body.name} leaves the workspace box", over.any(axis=(1, 2))),
-            (f"{body.name} comes too near to the table", low.any(axis=1)),
+            (f"{body.name} leaves the workspace box", (room - reach).min(axis=1) < 0.0),
+            (f"{body.name} comes too near to the table", (height - reach).min(axis=1) < 0.0),
         ]
         for keepout in scene.keepouts:
             away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
-            hit = np.linalg.norm(away, axis=-1) < reach
-            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit.any(axis=1)))
+            hit = (np.linalg.norm(away, axis=-1) - reach).min(axis=1) < 0.0
+            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit))
         for name, centre, radius in scene.balls:
-            near = np.linalg.norm(centres - centre, axis=-1) < reach + radius
-            checks.append((f"{body.name} comes too near to the {name}", near.any(axis=1)))
+            near = np.linalg.norm(centres - centre, axis=-1) - reach - radius
+            checks.append((f"{body.name} comes too near to the {name}", near.min(axis=1) < 0.0))
         return checks
 
 
-def _pairs(bodies: tuple[Body, ...]) -> list[tuple[Body, Body]]:
+def _pairs(bodies: tuple[Body, ...]) -> list[tuple[int, int]]:
     return [
-        (one, other)
+        (i, j)
         for i, one in enumerate(bodies)
-        for other in bodies[i + 1 :]
-        if _can_meet(one.frame, other.frame)
+        for j, other in enumerate(bodies)
+        if i < j and _can_meet(one.frame, other.frame)
     ]
 
 
@@ -200,10 +204,10 @@ def _can_meet(one: int, other: int) -> bool:
     return abs(one - other) >= (2 if inner else 3)
 
 
-def _gap(a: Array, a_radii: Array, b: Array, b_radii: Array) -> Array:
-    """Smallest distance (n,) between two sets of spheres (n, k, 3) and (n, m, 3)."""
-    distance = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1)
-    return (distance - a_radii[:, None] - b_radii).min(axis=(1, 2))
+def _meet(a: Array, a_radii: Array, b: Array, b_radii: Array) -> Mask:
+    """Whether any sphere of (n, k, 3) touches any of (n, m, 3)."""
+    squares = (a**2).sum(-1)[:, :, None] + (b**2).sum(-1)[:, None] - 2 * a @ np.swapaxes(b, 1, 2)
+    return (squares - (a_radii[:, None] + b_radii) ** 2).min(axis=(1, 2)) < 0.0
 
 
 def guard_of(config: CellConfig) -> Guard:
@@ -241,8 +245,7 @@ def _hull(name: str, hull: Box) -> Body:
 class GuardedRobot:
     """A Robot whose every motion is allowed by a person and by the guard, and capped in speed.
 
-    `permission()` raises NotEnabled when motion is not allowed now; `speed` is the fraction of
-    the configured speed that the present run may use.
+    `permission()` raises NotEnabled when motion is not allowed now.
     """
 
     def __init__(
@@ -251,7 +254,6 @@ class GuardedRobot:
         self._robot, self.guard, self._permission = robot, guard, permission
         self._joint_speed = float(np.radians(config.robot.joint_speed_deg_s))
         self._tcp_speed = config.robot.tcp_speed_m_s
-        self.speed = 1.0
 
     async def identity(self) -> Identity:
         return await self._robot.identity()
@@ -287,4 +289,4 @@ class GuardedRobot:
     def _capped(self, start: Array, target: Target) -> float:
         tip = self.guard.tip_speed(start, target.path, self._joint_speed)
         cap = 1.0 if tip <= self._tcp_speed else self._tcp_speed / tip
-        return min(target.speed * self.speed, cap)
+        return min(target.speed, cap)

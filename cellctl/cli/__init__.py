@@ -1,1 +1,1 @@
-
+"""The person's face of cellctl."""

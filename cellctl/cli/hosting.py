@@ -1,0 +1,73 @@
+"""Commands that run a cell on this machine, or give it leave to move."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cellctl.cli import words
+from cellctl.cli.display import ProgressBar
+from cellctl.cli.logs import log_to_stderr
+from cellctl.cli.options import AsJson, ConfigFile
+from cellctl.cli.output import emit, say
+from cellctl.cli.results import print_data, print_table, print_verdict
+
+
+def serve(config: ConfigFile) -> int:
+    """Run the daemon of a cell until SIGTERM or Ctrl-C."""
+    log_to_stderr()
+    from cellctl.config import load_config
+    from cellctl.daemon import serve_forever
+
+    return serve_forever(load_config(config))
+
+
+def enable(
+    duration: Annotated[str, typer.Option("--for", help="As 8h, 90m or 1h30m.")] = "8h",
+    config: Annotated[
+        Path | None, typer.Option(help="The cell's TOML file, if its data_dir is its own.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Permit motion for a while. Only on the cell's own machine, by who may write its data."""
+    from cellctl import permission
+
+    directory = _data_dir(config)
+    grant = permission.enable(directory, permission.parse_duration(duration))
+    if as_json:
+        emit({"data_dir": str(directory), "until": grant.until, "by": grant.by})
+    else:
+        say(f"motion is enabled until {words.clock(grant.until)} ({directory})")
+
+
+def _data_dir(config: Path | None) -> Path:
+    """Of the config; else CELLCTL_DATA; else where every cell's data are by default."""
+    from cellctl.config import CellSection, load_config
+
+    if config is not None:
+        return load_config(config).data_dir()
+    default: str = CellSection.model_fields["data_dir"].default
+    return Path(os.environ.get("CELLCTL_DATA") or default).expanduser()
+
+
+def demo(
+    cell: Annotated[str, typer.Option(help="Which simulated cell: cr.")] = "cr",
+    seed: Annotated[int, typer.Option(min=0, help="Draws the cell's true geometry.")] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Calibrate a simulated cell, unattended, and score it against its truth."""
+    log_to_stderr()
+    from cellctl.demo import run_demo
+
+    with ProgressBar() as bar:
+        result = run_demo(cell, seed, follow=bar.show)
+    if as_json:
+        emit(result)
+    else:
+        print_verdict(result["final"]["verdict"], result["final"].get("reasons"))
+        print_table("stages", result["stages"])
+        print_data({k: v for k, v in result.items() if k != "stages"})
+    return 0 if result["final"]["verdict"] == "pass" else 1

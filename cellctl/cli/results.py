@@ -1,0 +1,96 @@
+"""Results as a person reads them: the verdict first, then tables and figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from cellctl.cli import words
+from cellctl.cli.output import out, say
+from cellctl.messages import RunInfo
+
+MAX_ROWS = 40
+
+
+def print_run(run: RunInfo) -> None:
+    """A run: outcome, reasons, figures, where it lies, what to do next."""
+    say(words.headline(run))
+    for reason in run.reasons:
+        say(f"  - {reason}")
+    if run.question:
+        say(f"It asks: {run.question.text}")
+    data = (run.result or {}).get("data")
+    if isinstance(data, dict):
+        print_data(data)
+    facts = {
+        "calibration": run.calibration_id,
+        "recorded": f"{run.samples} samples in {run.directory}" if run.directory else None,
+    }
+    print_data({name: value for name, value in facts.items() if value})
+    for text in words.advice(run):
+        say(text)
+
+
+def print_verdict(verdict: Any, reasons: Any) -> None:
+    """As `PASS` or `FAIL`, with the reasons."""
+    say(str(verdict).upper())
+    for reason in reasons or []:
+        say(f"  - {reason}")
+
+
+def print_data(data: dict[str, Any]) -> None:
+    """Any JSON object: figures by name, rows of equal objects as a table; long lists are cut."""
+    tables = {name: rows for name, rows in data.items() if _is_table(rows)}
+    for name, value in _figures({k: v for k, v in data.items() if k not in tables}):
+        out.print(f"{name:<26} {value}", markup=False, soft_wrap=True)
+    for name, rows in tables.items():
+        print_table(name, rows)
+
+
+def print_table(title: str, rows: list[dict[str, Any]]) -> None:
+    """Rows with the same keys; more than 40 are cut."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    for number, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=number == 0)  # names stay whole
+    for row in rows[:MAX_ROWS]:
+        table.add_row(*(short(row.get(column)) for column in columns))
+    out.print(table)
+    if len(rows) > MAX_ROWS:
+        say(f"... and {len(rows) - MAX_ROWS} more (--json shows all)")
+
+
+def short(value: Any) -> str:
+    """A value in a cell of a table."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return _short_list(value)
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {short(item)}" for key, item in value.items())
+    return str(value)
+
+
+def _short_list(value: list[Any]) -> str:
+    if len(value) > 6 or any(isinstance(item, list | dict) for item in value):
+        return f"({len(value)} items)"
+    return " ".join(short(item) for item in value) or "none"
+
+
+def _figures(data: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    lines: list[tuple[str, str]] = []
+    for name, value in data.items():
+        if isinstance(value, dict) and value:
+            lines += _figures(value, f"{prefix}{name}.")
+        else:
+            lines.append((prefix + name, short(value)))
+    return lines
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
