@@ -33,6 +33,7 @@ from cellctl.sim.world import World
 
 SCHEMA = "cellctl-sim/1"
 LOCK_TRIES, LOCK_RETRY_S = 10, 0.05
+LINGER_S = 1.0
 log = structlog.get_logger("cellctl.sim")
 
 
@@ -166,6 +167,7 @@ class Server:
                 reply, pixels = {"error": {"code": error.code, "message": error.message}}, b""
                 if isinstance(error, BrokenFrame):
                     writer.write(self._frame(header, reply, pixels))
+                    await _drained(reader, writer)
                     return
             except (asyncio.IncompleteReadError, ConnectionError):
                 raise
@@ -204,6 +206,15 @@ class Server:
     async def _render(self, function: Callable[..., Any], *args: Any) -> Any:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._thread, function, *args)
+
+
+async def _drained(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Close our side and wait a little for the other one: a hard close would lose the reply."""
+    writer.write_eof()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LINGER_S):
+            while await reader.read(1 << 16):
+                pass
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 
 from cellctl.geometry import Array
 from cellctl.sim.lens import Lens
@@ -154,14 +154,18 @@ def dense(function: Callable[[Array], Array], shape: tuple[int, int], step: int)
 
     Evaluated every `step` pixels at most; exact to the fourth order between.
     """
-    rows, columns = (np.linspace(0, n - 1, -(-n // step) + 1) for n in shape)
+    rows, columns = (np.linspace(0, n - 1, max(-(-n // step), 3) + 1) for n in shape)
     values = function(np.stack(np.meshgrid(columns, rows), axis=-1))
-    full = np.empty((values.shape[-1], *shape), dtype=np.float32)
-    for layer, value in zip(full, np.moveaxis(values, -1, 0), strict=True):
-        layer[:] = RectBivariateSpline(rows, columns, value)(
-            np.arange(shape[0]), np.arange(shape[1])
-        )
-    return full
+    down, across = (_weights(nodes, n) for nodes, n in zip((rows, columns), shape, strict=True))
+    layers = [down @ value @ across.T for value in np.moveaxis(values, -1, 0)]
+    return np.array(layers, dtype=np.float32)
+
+
+def _weights(nodes: Array, count: int) -> Array:
+    """(count, len(nodes)): how the cubic spline through values at `nodes` depends on them, at
+    0, 1, ... count - 1."""
+    weights: Array = make_interp_spline(nodes, np.eye(len(nodes)), k=3)(np.arange(count))
+    return weights
 
 
 class View:

@@ -169,7 +169,7 @@ def test_the_same_goal_is_the_same_pose_to_the_last_bit_whatever_the_way(truth):
 
 def test_repeatability_is_as_specified(truth):
     arm, t, poses = Arm(truth, 0.0), 1.0, []
-    for i in range(250):
+    for i in range(120):
         t = arm.move(t, WORK[None], LIMITS, f"{i}") + 1.0
         flange = arm.frames(np.array([t]))[0, 6]
         reached = truth.arm.forward(arm.read(t).joints)

@@ -36,7 +36,7 @@ from tests.sim.scenes import (
 
 SEED = 3
 BIAS_PX = 0.02
-VIEWS = 24
+VIEWS = 16
 WIDTH, HEIGHT = CR.camera.size_px
 WHITE = np.full((1080, 1920), 255, dtype=np.uint8)
 
