@@ -19,8 +19,8 @@ from cellctl.sim import requests as form
 from cellctl.sim.grid import Grid, describe
 from cellctl.sim.motion import TICK_S, Limits
 from cellctl.sim.optics import Renderer
+from cellctl.sim.pace import Pace
 from cellctl.sim.robot import Reading
-from cellctl.sim.time import Pace
 from cellctl.sim.world import Exposure, World
 
 Answer = tuple[dict[str, Any], bytes]

@@ -36,6 +36,9 @@ BINNING = 4
 interpolated linearly: at the steepest board that can be read that is off by 0.002 pixels."""
 REGION_CAP = 900_000
 """A board that covers more camera pixels than this is not supersampled: it is large enough."""
+STRIP = 16
+COVER_REACH = 2.0
+"""Coarse pixels around a silhouette in which its soft edge can lie."""
 SIDE_LIGHT = 0.4
 """Share of the room's light on what faces down; it grows to 1 on what faces up."""
 WIDEST_RAY = 1.5
@@ -167,20 +170,45 @@ class Painter:
         beam: tuple[Region, Array] | None,
         printed: Array | None,
     ) -> None:
-        """Lay a surface onto the picture, at full resolution, where it is in front."""
-        full = surface.region.times(BINNING).cropped(canvas.grey.shape)
+        """Lay a surface onto the picture, at full resolution, where it is in front.
+
+        In strips: what a slanting arm does not cover is left alone, and caches are not overrun.
+        """
+        layers = {name: _rimmed(layer) for name, layer in surface.layers.items()}
+        layers["margin"] = _rimmed(surface.margin)
+        covered = surface.margin > -COVER_REACH * self._coarse.pixel
+        for top in range(0, len(covered), STRIP):
+            strip = bounding(covered[top : top + STRIP]).moved(0, top)
+            if strip:
+                self._lay_strip(canvas, surface.region, strip, layers, beam, printed)
+
+    def _lay_strip(
+        self,
+        canvas: Canvas,
+        region: Region,
+        strip: Region,
+        layers: dict[str, Array],
+        beam: tuple[Region, Array] | None,
+        printed: Array | None,
+    ) -> None:
+        """Of `_lay`: the part `strip` of `region`, both in coarse pixels."""
+        full = strip.moved(region.left, region.top).times(BINNING).cropped(canvas.grey.shape)
         inside = (slice(0, full.bottom - full.top), slice(0, full.right - full.left))
-        fine = {name: _finer(layer, BINNING)[inside] for name, layer in surface.layers.items()}
+        fine = {name: _finer(layer, strip)[inside] for name, layer in layers.items()}
         colour = fine["room"]
         if beam is not None:
-            colour = colour + fine["white"] * _light_at(fine["u"], fine["v"], *beam)
+            colour += fine["white"] * _light_at(fine["u"], fine["v"], *beam)
         if printed is not None:
-            colour = colour * printed[inside]
-        cover = _finer(surface.margin, BINNING)[inside] * np.float32(0.5 / self._view.pixel)
-        cover = np.clip(cover + np.float32(0.5), 0, 1)
+            colour *= printed[strip.times(BINNING).slices][inside]
+        cover = fine["margin"]
+        cover *= np.float32(0.5 / self._view.pixel)
+        cover += np.float32(0.5)
+        np.clip(cover, 0, 1, out=cover)
         grey, behind = canvas.grey[full.slices], canvas.depth[full.slices]
         cover *= fine["depth"] < behind
-        grey += cover * (colour - grey)
+        colour -= grey
+        colour *= cover
+        grey += colour
         np.copyto(behind, fine["depth"], where=cover > 0.5)
 
     def _printed(self, printed: Texture, x: Array, y: Array, depth: Array) -> Array:
@@ -189,7 +217,9 @@ class Painter:
         fine = 2 if pixels <= REGION_CAP else 1
         level = printed.level_for(float(np.median(depth)) * self._view.pixel / fine)
         places = printed.places(x, y, level)
-        sample = printed.sample(_finer(places, BINNING * fine), level)
+        whole = Region(0, 0, *depth.shape[::-1])
+        fine_places = [_finer(_rimmed(a), whole, BINNING * fine) for a in places]
+        sample = printed.sample(fine_places[0], fine_places[1], level)
         sigma = self._truth.preset.camera.defocus_px * fine
         blurred = cv2.GaussianBlur(sample, (0, 0), sigma)
         size = (depth.shape[0] * BINNING, depth.shape[1] * BINNING)
@@ -245,11 +275,15 @@ def _light_at(u: Array, v: Array, region: Region, light: Array) -> Array:
     return cv2.remap(light, columns, rows, cv2.INTER_LINEAR)
 
 
-def _finer(values: Array, n: int) -> Array:
-    """(h n, w n, ...) from (h, w, ...) given at the middles of blocks; linear also at the rim."""
-    edge = [(1, 1), (1, 1)] + [(0, 0)] * (values.ndim - 2)
-    padded = np.pad(values, edge, mode="reflect", reflect_type="odd")
-    fine = cv2.resize(padded, None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
+def _rimmed(values: Array) -> Array:
+    """With a rim of one more value on every side, continued linearly."""
+    return np.pad(values, 1, mode="reflect", reflect_type="odd")
+
+
+def _finer(rimmed: Array, part: Region, n: int = BINNING) -> Array:
+    """What is given at the middles of n x n blocks, at every pixel of the blocks of `part`."""
+    around = rimmed[part.top : part.bottom + 2, part.left : part.right + 2]
+    fine = cv2.resize(around, None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
     return fine[n:-n, n:-n]
 
 

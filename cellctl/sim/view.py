@@ -28,8 +28,6 @@ GRAZING = 1e-5
 """What is nearer than this to a lens's plane is not seen."""
 GRID_STEP_PX = 32
 Normal = tuple[Array, Array, Array]
-ONE_MAP = np.empty((0, 0), dtype=np.float32)
-"""OpenCV's second map, for when the first holds both coordinates."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -407,6 +407,24 @@ async def test_paced_time_is_real_time(paced):
         assert abs(frames[1].t - time.monotonic()) < 2.0
 
 
+async def test_time_and_other_devices_go_on_while_a_picture_is_rendered(paced):
+    async with devices(paced) as cell:
+        await cell.robot.move(to(WORK), timeout_s=30)
+        move = asyncio.create_task(cell.robot.move(to(WORK + 0.4), timeout_s=30))
+        await asyncio.sleep(0.4)
+        moving = cell.clock.now()
+        grab = asyncio.create_task(cell.camera.grab(exposed_after=moving))
+        reads, watcher = [], Link("watcher", paced.cell)
+        while not grab.done():
+            reads.append((await watcher.request("robot.read"))[0]["at"])
+            await asyncio.sleep(0.01)
+        await watcher.close()
+        assert len(reads) > 5
+        assert reads[-1] > reads[0] + 0.05
+        await grab
+        await move
+
+
 async def test_stepped_time_passes_only_while_somebody_waits(endpoint):
     async with devices(endpoint) as cell:
         before = (await cell.robot.read(), cell.clock.now())[1]

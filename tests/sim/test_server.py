@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from cellctl.config import SimulationSection
 from cellctl.errors import BadInput, DeviceFault, NotFound
 from cellctl.sim.doors import DOORS
-from cellctl.sim.launch import connect_or_start, endpoint_file, read_endpoint, stop_world
+from cellctl.sim.endpoint import read_endpoint
+from cellctl.sim.launch import connect_or_start, endpoint_file, stop_world
 from cellctl.sim.link import Link
 from cellctl.sim.wire import HOST, LENGTHS, MAX_BLOB, MAX_HEADER, pack, read_frame
 from tests.sim.worlds import world

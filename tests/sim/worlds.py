@@ -15,10 +15,10 @@ from cellctl.drivers.base import Path as JointPath
 from cellctl.drivers.base import Target
 from cellctl.geometry import Array
 from cellctl.sim.drivers import SimCamera, SimProjector, SimRobot
+from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.launch import connect_or_start, stop_world
 from cellctl.sim.link import SimClock
 from cellctl.sim.scoring import FaultPlanter, Scorer
-from cellctl.sim.server import Endpoint
 
 CONFIG_FILE = Path(__file__).parents[2] / "config" / "sim-cr.toml"
 WORK = np.radians([-76.0, -84.0, -111.0, -75.0, 90.0, -166.0])
