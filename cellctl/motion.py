@@ -32,7 +32,7 @@ MAX_STEP_M = 0.01
 COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
-STANDSTILL_S = 0.05
+STANDSTILL_RAD_S = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,9 +275,7 @@ class GuardedRobot:
         self._permission()
         if not 0.0 < target.speed <= 1.0:
             raise MotionRefused(f"speed fraction {target.speed} is not in (0, 1]")
-        state = await self._robot.read()
-        if state.standstill_s < STANDSTILL_S:
-            raise MotionRefused("the arm is still moving; a path starts at standstill")
+        state = await self._standing()
         self.guard.check(state.joints, target.path)
         await self._robot.check(target.path)
         speed = self._capped(state.joints, target)
@@ -285,6 +283,17 @@ class GuardedRobot:
 
     async def stop(self, *, clean: bool) -> None:
         await self._robot.stop(clean=clean)
+
+    async def _standing(self) -> RobotState:
+        """The measured state at standstill; an arm that still moves, as after a lost link, is
+        stopped first. MotionRefused when it goes on moving."""
+        state = await self._robot.read()
+        if np.abs(state.speeds).max() > STANDSTILL_RAD_S:
+            await self._robot.stop(clean=True)
+            state = await self._robot.read()
+        if np.abs(state.speeds).max() > STANDSTILL_RAD_S:
+            raise MotionRefused("the arm is moving though it was stopped; a path starts at rest")
+        return state
 
     def _capped(self, start: Array, target: Target) -> float:
         tip = self.guard.tip_speed(start, target.path, self._joint_speed)

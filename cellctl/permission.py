@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from cellctl.errors import BadInput, NotEnabled
-from cellctl.files import Schema, read_document, storage, write_document
+from cellctl.store.files import Schema, read_document, storage, write_document
 
 SCHEMA = Schema("cellctl-permission", 1)
 FILE = "motion-permission.json"

@@ -20,9 +20,9 @@ from pydantic import BaseModel, ValidationError
 from cellctl.cell import Cell, Solver
 from cellctl.drivers.base import SAMPLE, Image
 from cellctl.errors import BadInput
-from cellctl.history import Sample, address
 from cellctl.messages import Progress, Verdict
-from cellctl.store import RunRecord
+from cellctl.store.history import Sample, address
+from cellctl.store.store import RunRecord
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 CALL_S = 120.0
@@ -50,13 +50,19 @@ class Result:
 
 @dataclass(frozen=True)
 class Procedure:
-    """A procedure that can be asked for by name. `moves`: it needs the permission to move."""
+    """A procedure that can be asked for by name. `moves`: it needs the permission to move.
+
+    `conclude` is its pure part, from what was recorded in `steps` (names by scope) to the result:
+    `run` ends with it, and it is all that solving a run again needs.
+    """
 
     name: str
     summary: str
     params: type[BaseModel]
     moves: bool
     run: Callable[[Run, Cell, Any], Awaitable[Result]]
+    conclude: Callable[[Any], Result] | None = None
+    steps: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def parse(self, given: Mapping[str, Any]) -> BaseModel:
         """The parameters, checked. BadInput names the one that is wrong, or unknown and nearest."""

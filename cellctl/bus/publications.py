@@ -13,12 +13,12 @@ from typing import cast
 import structlog
 import zenoh
 
-from cellctl.bulletin import Published
 from cellctl.bus.keys import Keys
 from cellctl.bus.preview import encode_preview
 from cellctl.bus.session import plain
 from cellctl.drivers.base import Image
 from cellctl.engine import Engine
+from cellctl.engine.bulletin import Published
 from cellctl.errors import CellctlError
 from cellctl.messages import Event, Message, Progress, RobotSnapshot
 

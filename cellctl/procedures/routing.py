@@ -18,7 +18,9 @@ STEP_RAD = 0.25
 MARGIN_RAD = 1.2
 MAX_TRIES = 200
 SHORTCUTS = 30
-NEIGHBOURS = 4
+NEIGHBOURS = 5
+CLUSTER_RAD = 0.8
+"""Postures nearer than this are likely to be joined by a free line."""
 
 
 class Tree:
@@ -47,52 +49,75 @@ class Tree:
 
 
 class Roadmap:
-    """All of the postures `nodes` (n, 6) that free joint lines join to `root` (6,), as a tree.
+    """Postures `nodes` (n, 6) joined to `root` (6,) by free joint lines, as a tree.
 
     Grown nearest node first (Prim), so that neighbours on the tree are near in joint space.
     `index` maps a reached node's number to its place on the tree.
     """
 
     def __init__(self, guard: Guard, root: Array, nodes: Array) -> None:
-        self.guard, self.tree = guard, Tree(root)
+        self.guard, self.tree, self.nodes = guard, Tree(root), nodes
         self.index: dict[int, int] = {}
-        self._grow(nodes)
+        self._tried: list[set[int]] = [set() for _ in nodes]
+        self._grow()
 
-    def path(self, start: Array, a: int, b: int) -> Path:
-        """From the posture `start`, at tree node `a`, to tree node `b`."""
+    def path(self, start: Array, b: int) -> Path:
+        """From the posture `start`, which stands at the tree's root, to tree node `b`."""
         goal = self.tree.nodes[b]
         if self.guard.allows(start, Path(goal[None])):
             return Path(goal[None])
-        up, down = self.tree.branch(a), self.tree.branch(b)
-        meet = next(i for i in up if i in set(down))
-        walk = up[: up.index(meet) + 1] + down[: down.index(meet)][::-1]
-        corners = [start, *(self.tree.nodes[i] for i in walk[1:])]
-        return Path(shortened(self.guard, np.array(corners), seed=b)[1:])
+        down = self.tree.branch(b)[::-1]
+        corners = np.array([start, *(self.tree.nodes[i] for i in down[1:])])
+        return Path(shortened(self.guard, corners, seed=b)[1:])
 
-    def _grow(self, nodes: Array) -> None:
-        left = set(range(len(nodes)))
-        gap = np.abs(nodes - self.tree.nodes[0]).max(axis=1)
-        tried: dict[int, set[int]] = {i: set() for i in left}
-        while left:
-            i = min(left, key=lambda k: (gap[k], k))
+    def bridge(self) -> bool:
+        """Search a path to the thickest cluster of nodes that was not reached, and grow on there.
+
+        False when there is none left, or none was found.
+        """
+        left = [i for i in range(len(self.nodes)) if i not in self.index]
+        if not left:
+            return False
+        rest = self.nodes[left]
+        gaps = np.abs(rest[:, None] - rest[None]).max(axis=2)
+        goal = rest[int(np.argmax((gaps < CLUSTER_RAD).sum(axis=1)))]
+        parent = int(self.tree.nearest(goal)[0])
+        path = connect(self.guard, self.tree.nodes[parent], goal, seed=len(left))
+        if path is None:
+            return False
+        for corner in path.waypoints:
+            parent = self.tree.add(corner, parent)
+        self._grow()
+        return True
+
+    def _grow(self) -> None:
+        left = [i for i in range(len(self.nodes)) if i not in self.index]
+        gap = {i: self._gap(self.nodes[i]) for i in left}
+        while gap:
+            i = min(gap, key=lambda k: (gap[k], k))
             if not np.isfinite(gap[i]):
                 return
-            parent = self._parent(nodes[i], tried[i])
+            parent = self._parent(i)
             if parent is None:
                 gap[i] = np.inf
                 continue
-            self.index[i] = self.tree.add(nodes[i], parent)
-            left.discard(i)
-            reach = np.abs(nodes - nodes[i]).max(axis=1)
-            gap = np.where(np.isinf(gap) & (reach > 1.0), np.inf, np.minimum(gap, reach))
+            self.index[i] = self.tree.add(self.nodes[i], parent)
+            del gap[i]
+            for k in gap:
+                reach = float(np.abs(self.nodes[k] - self.nodes[i]).max())
+                if np.isfinite(gap[k]) or reach < CLUSTER_RAD:
+                    gap[k] = min(gap[k], reach)
 
-    def _parent(self, node: Array, tried: set[int]) -> int | None:
-        """The nearest tree node with a free line to `node`; those tried before are passed over."""
-        for parent in map(int, self.tree.nearest(node, NEIGHBOURS)):
-            if parent in tried:
+    def _gap(self, node: Array) -> float:
+        return float(np.abs(np.array(self.tree.nodes) - node).max(axis=1).min())
+
+    def _parent(self, i: int) -> int | None:
+        """The nearest tree node with a free line to node `i`; those tried are passed over."""
+        for parent in map(int, self.tree.nearest(self.nodes[i], NEIGHBOURS)):
+            if parent in self._tried[i]:
                 continue
-            tried.add(parent)
-            if self.guard.allows(self.tree.nodes[parent], Path(node[None])):
+            self._tried[i].add(parent)
+            if self.guard.allows(self.tree.nodes[parent], Path(self.nodes[i][None])):
                 return parent
         return None
 

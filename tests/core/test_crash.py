@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from cellctl.journal import read
+from cellctl.store.history import History
+from cellctl.store.journal import read
 from tests.core.processes import alive, python
 
 KILLS = int(os.environ.get("CELLCTL_SOAK", "12"))
@@ -62,9 +63,13 @@ def instant(chance: random.Random) -> tuple[int, float]:
 
 
 def journalled(directory: Path) -> list[str]:
-    """The keys of all samples in the newest run's journal, which must not be damaged."""
+    """The keys of all samples in the newest run's journal, which must not be damaged and must not
+    name a picture that is not there."""
     runs = sorted((directory / "runs").glob("2*"))
     entries = read(runs[-1] / "journal.jsonl").intact() if runs else []
+    for samples in History(runs[-1], entries).steps().values() if runs else ():
+        for sample in samples.values():
+            assert sample.images["camera"].load().shape == (24, 32)
     return [entry.data["key"] for entry in entries if entry.kind == "sample"]
 
 

@@ -6,9 +6,10 @@ import asyncio
 import json
 
 import pytest
+import structlog
 
-from cellctl.bulletin import KEPT, Bulletin
-from cellctl.engine import TRANSITIONS, IllegalTransition, transition
+from cellctl.engine.bulletin import KEPT, Bulletin
+from cellctl.engine.engine import TRANSITIONS, IllegalTransition, transition
 from cellctl.errors import BadInput, Busy, DeviceFault, NotEnabled, NotFound
 from cellctl.messages import Event, Phase, Progress, PromoteRequest, RunRequest, State
 from cellctl.permission import enable
@@ -280,6 +281,18 @@ async def test_cancelling_twice_or_late_does_no_harm(toy):
     assert [e.kind for e in toy.journal(run_id)].count("cancelled") == 1
 
 
+@pytest.mark.parametrize("kind", ["wait", "busy"])
+async def test_cancel_reaches_a_procedure_at_once_and_at_its_checkpoints(toy, kind):
+    run_id = await toy.start("troubled", kind=kind)
+    await toy.until(lambda: "step" in toy.events())
+    with structlog.testing.capture_logs() as logs:
+        await toy.cancel()
+        assert (await toy.ended(run_id)).status == "cancelled"
+    assert toy.robot.stops == [True]
+    assert toy.engine.state().phase == "idle"
+    assert [line["event"] for line in logs if line["log_level"] == "error"] == []
+
+
 async def test_cancel_before_the_procedure_began(toy):
     run_id = await toy.start("survey")
     await toy.cancel()
@@ -310,6 +323,7 @@ async def test_cancel_in_the_middle_of_the_maths(toy):
     [
         ("bad input", "failed", "^the board is upside down$", None),
         ("fault", "interrupted", "the camera was unplugged", "the camera was unplugged"),
+        ("not enabled", "interrupted", "the permission to move ended", None),
         ("group", "interrupted", "the projector went dark", "the projector went dark"),
         ("child death", "interrupted", "exited with code 4", "exited with code 4"),
         ("child defect", "failed", "divide_by_zero failed: ZeroDivisionError", None),
@@ -485,12 +499,14 @@ async def test_a_late_answer_is_not_taken_for_another_questions(toy):
 async def test_cancel_while_waiting(toy):
     run_id = await toy.start("asking")
     await toy.phase("waiting")
-    await toy.cancel()
-    state = toy.engine.state()
-    assert (state.phase, state.question) == ("stopping", None)
-    with pytest.raises(BadInput, match="nothing to acknowledge"):
-        await toy.ack("red")
-    assert (await toy.ended(run_id)).status == "cancelled"
+    with structlog.testing.capture_logs() as logs:
+        await toy.cancel()
+        state = toy.engine.state()
+        assert (state.phase, state.question) == ("stopping", None)
+        with pytest.raises(BadInput, match="nothing to acknowledge"):
+            await toy.ack("red")
+        assert (await toy.ended(run_id)).status == "cancelled"
+    assert [line["event"] for line in logs if line["log_level"] == "error"] == []
 
 
 async def test_a_question_with_a_deadline_is_withdrawn(toy):
@@ -643,7 +659,7 @@ async def test_a_result_that_was_journalled_is_finished_without_moving(tmp_path)
         assert (await toy.engine.run_info(whole.run_id)).status == "interrupted"
         await toy.resume(whole.run_id)
         again = await toy.ended(whole.run_id)
-        assert toy.robot.moves == 0
+        assert toy.events() == ["resumed", "ended"], "the procedure is not run again"
     assert again.status == "done"
     assert again.result == whole.result
 

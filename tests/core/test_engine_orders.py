@@ -13,10 +13,10 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cellctl.engine import TRANSITIONS
+from cellctl.engine.engine import TRANSITIONS
 from cellctl.errors import CellctlError
-from cellctl.history import ENDED, standing_of
 from cellctl.messages import State
+from cellctl.store.history import ENDED, standing_of
 from tests.core.toy import Bench, bench
 
 PROCEDURES = {

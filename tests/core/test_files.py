@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cellctl.errors import BadInput, StorageFault
-from cellctl.files import Schema, read_document, sweep, to_json, write_atomically, write_document
+from cellctl.store.files import (
+    Schema,
+    read_document,
+    sweep,
+    to_json,
+    write_atomically,
+    write_document,
+)
 
 OLD = Schema("cellctl-thing", 2)
 NEW = Schema("cellctl-thing", 3, upgrade=lambda content: {**content, "unit": "m"})

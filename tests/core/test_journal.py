@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cellctl.errors import BadInput, StorageFault
-from cellctl.files import Schema
-from cellctl.journal import Journal, read
+from cellctl.store.files import Schema
+from cellctl.store.journal import Journal, read
 from tests.core.processes import python
 
 DATA: list[dict[str, Any]] = [
@@ -128,7 +128,7 @@ def test_lines_that_are_missing_twice_or_of_another_journal_are_noticed(tmp_path
 
 def test_a_newer_journal_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "journal.jsonl"
-    monkeypatch.setattr("cellctl.journal.SCHEMA", Schema("cellctl-journal", 2))
+    monkeypatch.setattr("cellctl.store.journal.SCHEMA", Schema("cellctl-journal", 2))
     written(path)
     monkeypatch.undo()
     with pytest.raises(BadInput, match="written by a newer cellctl"):
@@ -151,7 +151,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from cellctl.errors import StorageFault
-from cellctl.journal import Journal
+from cellctl.store.journal import Journal
 
 path = Path(sys.argv[1])
 journal = Journal.create(path, "run-1")

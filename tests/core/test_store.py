@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cellctl.calibration_store import CalibrationStore
 from cellctl.errors import BadInput, Busy, NotFound, StorageFault
-from cellctl.history import standing_of
-from cellctl.journal import read
-from cellctl.run_folder import RunHeader, new_run_id, read_run
 from cellctl.store import Store
+from cellctl.store.calibrations import CalibrationStore
+from cellctl.store.history import standing_of
+from cellctl.store.journal import read
+from cellctl.store.run_folder import RunHeader, new_run_id, read_run
 from tests.core.processes import python, said
 
 IMAGE = np.random.default_rng(1).integers(0, 255, (60, 80), dtype=np.uint8)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import structlog
 
-from cellctl import worker
 from cellctl.errors import DeviceFault, SolveError
-from cellctl.worker import CallFailed, Child
+from cellctl.worker import child as worker
+from cellctl.worker.child import CallFailed, Child
 from tests.core import functions
 from tests.core.processes import alive, python, said
 
@@ -200,7 +200,7 @@ async def test_the_loop_goes_on_while_the_child_computes(child):
 PARENT = """
 import asyncio, sys
 import structlog
-from cellctl.worker import Child
+from cellctl.worker.child import Child
 from tests.core import functions
 
 async def main():

@@ -18,17 +18,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field
 
-from cellctl.active_run import Limits
-from cellctl.bulletin import Published
 from cellctl.cell import Cell, Solver
 from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
 from cellctl.drivers.base import Path as Joints
 from cellctl.engine import Engine
-from cellctl.errors import BadInput, DeviceFault, MotionRefused
+from cellctl.engine.active_run import Limits
+from cellctl.engine.bulletin import Published
+from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotEnabled
 from cellctl.geometry import Transform
-from cellctl.journal import Entry, read
 from cellctl.messages import (
     Accepted,
     AckRequest,
@@ -43,7 +42,8 @@ from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
 from cellctl.store import Store
-from cellctl.worker import Child
+from cellctl.store.journal import Entry, read
+from cellctl.worker.child import Child
 from tests import cells
 from tests.core import functions
 
@@ -251,6 +251,18 @@ async def _late_fault(run: Run, params: Trouble) -> None:
         raise DeviceFault("the arm did not stop when it was told to") from None
 
 
+async def _not_enabled(run: Run, params: Trouble) -> None:
+    raise NotEnabled("the permission to move ended")
+
+
+async def _busy(run: Run, params: Trouble) -> None:
+    """Swallows its cancellation, and then computes and computes."""
+    with contextlib.suppress(asyncio.CancelledError):
+        await asyncio.sleep(params.seconds)
+    while True:
+        await run.checkpoint()
+
+
 async def _wait(run: Run, params: Trouble) -> None:
     await asyncio.sleep(params.seconds)
 
@@ -273,6 +285,8 @@ TROUBLES = {
     "cancels itself": _cancels_itself,
     "stubborn": _stubborn,
     "late fault": _late_fault,
+    "not enabled": _not_enabled,
+    "busy": _busy,
     "wait": _wait,
 }
 

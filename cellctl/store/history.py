@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cellctl.journal import Entry
 from cellctl.messages import Question, RunStatus, Verdict
-from cellctl.pictures import Picture
+from cellctl.store.journal import Entry
+from cellctl.store.pictures import Picture
 
 ENDED: frozenset[RunStatus] = frozenset({"done", "failed", "cancelled", "abandoned"})
 LIVE: frozenset[RunStatus] = frozenset({"running", "waiting"})

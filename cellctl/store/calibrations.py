@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from cellctl.errors import BadInput, NotFound
-from cellctl.files import Schema, read_document, sweep, utc_now, write_document
 from cellctl.messages import CalibrationInfo
+from cellctl.store.files import Schema, read_document, sweep, utc_now, write_document
 
 FILE = Schema("cellctl-calibration-file", 1)
 ACTIVE = Schema("cellctl-active", 1)

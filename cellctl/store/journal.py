@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from cellctl.errors import BadInput, StorageFault
-from cellctl.files import (
+from cellctl.store.files import (
     Schema,
     storage,
     sync_directory,

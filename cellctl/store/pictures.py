@@ -11,7 +11,7 @@ import numpy as np
 
 from cellctl.drivers.base import Image
 from cellctl.errors import BadInput
-from cellctl.files import write_atomically
+from cellctl.store.files import write_atomically
 
 PNG = (
     cv2.IMWRITE_PNG_COMPRESSION,

@@ -24,7 +24,7 @@ from typing import IO, Any, Self, cast
 import structlog
 
 from cellctl.errors import CellctlError, DeviceFault
-from cellctl.worker_child import COMMAND, Broke, Parts, Raised, pack, receive, send, unpack
+from cellctl.worker.far_side import COMMAND, Broke, Parts, Raised, pack, receive, send, unpack
 
 START_S = 30.0
 EXIT_S = 2.0

@@ -14,9 +14,9 @@ from typing import Any
 from cellctl.cell import Cell
 from cellctl.drivers.base import Camera, Projector, Robot
 from cellctl.errors import BadInput, DeviceFault
-from cellctl.files import to_json, utc_now
 from cellctl.messages import RunRequest
-from cellctl.run_folder import RunHeader, new_run_id
+from cellctl.store.files import to_json, utc_now
+from cellctl.store.run_folder import RunHeader, new_run_id
 
 LIBRARIES = (
     "cellctl",

@@ -12,10 +12,11 @@ from typing import Any, Literal
 
 import structlog
 
-from cellctl.active_run import ActiveRun, Limits
-from cellctl.bulletin import Bulletin, Callback
 from cellctl.cell import Cell
-from cellctl.ending import Ending
+from cellctl.engine.active_run import ActiveRun, Limits
+from cellctl.engine.bulletin import Bulletin, Callback
+from cellctl.engine.ending import Ending
+from cellctl.engine.provenance import look_at, versions
 from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound
 from cellctl.messages import (
     Accepted,
@@ -35,10 +36,9 @@ from cellctl.messages import (
     State,
 )
 from cellctl.permission import Permission
-from cellctl.provenance import look_at, versions
 from cellctl.run import Procedure
-from cellctl.run_folder import RunFolder
-from cellctl.store import RunRecord, Store
+from cellctl.store.run_folder import RunFolder
+from cellctl.store.store import RunRecord, Store
 
 PhaseEvent = Literal["start", "ask", "answer", "withdraw", "stop", "end", "fault", "ack"]
 

@@ -23,14 +23,21 @@ from typing import IO, Any, ParamSpec, TypeVar
 
 import structlog
 
-from cellctl.calibration_store import CalibrationStore
 from cellctl.drivers.base import Image
 from cellctl.errors import BadInput, Busy, NotFound
-from cellctl.files import read_document, storage, sweep, sync_directory, utc_now, write_document
-from cellctl.history import LIVE, History, Standing, advance, standing_of
-from cellctl.journal import Entry, Journal, read
-from cellctl.pictures import write_picture
-from cellctl.run_folder import JOURNAL, RESULT, RUN, RunFolder, RunHeader, read_header
+from cellctl.store.calibrations import CalibrationStore
+from cellctl.store.files import (
+    read_document,
+    storage,
+    sweep,
+    sync_directory,
+    utc_now,
+    write_document,
+)
+from cellctl.store.history import LIVE, History, Standing, advance, standing_of
+from cellctl.store.journal import Entry, Journal, read
+from cellctl.store.pictures import write_picture
+from cellctl.store.run_folder import JOURNAL, RESULT, RUN, RunFolder, RunHeader, read_header
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -11,10 +11,10 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cellctl.errors import BadInput
-from cellctl.files import Schema, read_document
-from cellctl.history import History, Standing, standing_of
-from cellctl.journal import read
 from cellctl.messages import Progress, RunInfo
+from cellctl.store.files import Schema, read_document
+from cellctl.store.history import History, Standing, standing_of
+from cellctl.store.journal import read
 
 RUN = Schema("cellctl-run", 1)
 RESULT = Schema("cellctl-result", 1)

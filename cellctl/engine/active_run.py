@@ -10,14 +10,14 @@ from typing import Any, Literal
 
 import structlog
 
-from cellctl.bulletin import Bulletin
 from cellctl.cell import Cell
-from cellctl.ending import Ending, ending_of
+from cellctl.engine.bulletin import Bulletin
+from cellctl.engine.ending import Ending, ending_of
 from cellctl.errors import BadInput, CellctlError, StorageFault
-from cellctl.files import utc_now
 from cellctl.messages import AckRequest, Progress, Question, RunStatus
 from cellctl.run import Procedure, Result, Run, StepCancelled
-from cellctl.store import RunRecord, Store
+from cellctl.store.files import utc_now
+from cellctl.store.store import RunRecord, Store
 
 RunEvent = Literal["ask", "answer", "withdraw", "stop"]
 

@@ -27,7 +27,7 @@ from typing import IO, Any
 
 from cellctl.errors import CellctlError
 
-COMMAND = "from cellctl.worker_child import main; main()"
+COMMAND = "from cellctl.worker.far_side import main; main()"
 """Not `-m`: the classes below must have the same module name on both sides."""
 
 PR_SET_PDEATHSIG = 1

@@ -1,0 +1,1 @@
+"""The supervisor of child processes (`child`) and what runs in them (`far_side`)."""
