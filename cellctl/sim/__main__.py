@@ -13,9 +13,10 @@ import structlog
 
 from cellctl.errors import CellctlError
 from cellctl.sim.cell_config import cell_document, to_toml
+from cellctl.sim.endpoint import Endpoint, only_one
 from cellctl.sim.launch import stop_endpoint
 from cellctl.sim.presets import PRESETS
-from cellctl.sim.server import Endpoint, Server, Settings, only_one
+from cellctl.sim.server import Server, Settings
 
 
 def main() -> int:

@@ -46,10 +46,11 @@ def bodies(truth: Truth) -> tuple[Body, ...]:
         for c in truth.arm.links
     ]  # fmt: skip
     sheets = {name: sheet(board, truth) for name, board in truth.boards.items()}
-    pen = Capsule(np.zeros(3), truth.pen - (0.0, 0.0, PEN_RADIUS_M), PEN_RADIUS_M)
+    tray = _tray(list(sheets.values()))
+    pen = Capsule(tray.pose[:3, 3], truth.pen - (0.0, 0.0, PEN_RADIUS_M), PEN_RADIUS_M)
     return (
         *links,
-        Body("tray", JOINTS, _tray(list(sheets.values())), "arm", TRAY_ALBEDO),
+        Body("tray", JOINTS, tray, "arm", TRAY_ALBEDO),
         Body("pen", JOINTS, pen, "arm", PEN_ALBEDO),
         *(Body(name, JOINTS, plate, name, 1.0) for name, plate in sheets.items()),
     )

@@ -24,6 +24,12 @@ LATENCY_SIGMAS = 6.0
 MAST_M = (0.20, 0.08, 1.6)
 """Width, depth and height of the mast at the table's far edge, for camera and projector."""
 
+SPEEDS = {
+    "joint_speed_deg_s": 40.0,
+    "joint_acceleration_deg_s2": 80.0,
+    "tcp_speed_m_s": 0.5,
+}
+
 COMMENTS = {
     "": """A simulated cell that runs as it is: `cellctl serve {path}`.
 Made by `python -m cellctl.sim config --cell {preset} --seed {seed}`; the truth behind it is
@@ -51,14 +57,15 @@ def cell_document(preset: Preset, seed: int) -> dict[str, Any]:
     """The config of the cell that `seed` draws from `preset`, as `cellctl.config` parses it."""
     truth = draw(preset, seed)
     rng = np.random.default_rng([seed, STREAMS.index("tape")])
+    boards = truth.boards
     taped = {
-        name: _taped(preset, pose, rng)
+        name: _taped(preset, pose.matrix, rng)
         for name, pose in (
-            ("camera", truth.camera.pose.matrix),
-            ("projector", truth.projector.pose.matrix),
-            ("table", truth.table.pose.matrix),
-            ("checkerboard", truth.boards["checkerboard"].pose.matrix),
-            ("markers", truth.boards["markers"].pose.matrix),
+            ("camera", truth.camera.pose),
+            ("projector", truth.projector.pose),
+            ("table", truth.table.pose),
+            ("checkerboard", boards["checkerboard"].pose),
+            ("markers", boards["markers"].pose),
         )
     }
     height = touched_height(truth)
@@ -71,27 +78,12 @@ def cell_document(preset: Preset, seed: int) -> dict[str, Any]:
         },
         "simulation": {"preset": preset.name, "seed": seed, "time": "stepped"},
         "tape": {"position_m": preset.tape_off_m, "angle_deg": preset.tape_off_deg},
-        "robot": {
-            "driver": "sim",
-            "arm": preset.arm,
-            "joint_speed_deg_s": 40.0,
-            "joint_acceleration_deg_s2": 80.0,
-            "tcp_speed_m_s": 0.5,
-        },
-        "camera": {
-            "driver": "sim",
-            "image_size_px": list(preset.camera.size_px),
-            "factory": _factory(truth, rng),
-            "pose": taped["camera"],
-        },
+        "robot": {"driver": "sim", "arm": preset.arm, **SPEEDS},
+        "camera": _camera(truth, rng) | {"pose": taped["camera"]},
         "projector": _projector(preset) | {"pose": taped["projector"]},
-        "table": {
-            "touched_height_m": round(height, 5),
-            "area_m": list(preset.table.area_m),
-            "pose": taped["table"],
-        },
+        "table": _table(preset, height) | {"pose": taped["table"]},
         "bracket": {
-            **{name: _mount(truth, name, taped[name]) for name in ("checkerboard", "markers")},
+            **{name: _mount(truth, name, taped[name]) for name in boards},
             "pen": {"tip_m": truth.nominal_pen.tolist(), "radius_m": 0.01},
         },
         "workspace": _workspace(truth, height),
@@ -105,15 +97,20 @@ def _taped(preset: Preset, pose: Array, rng: np.random.Generator) -> dict[str, l
     return {"position_m": _rounded(off[:3, 3], 3), "rpy_deg": _rounded(rpy, 1)}
 
 
-def _factory(truth: Truth, rng: np.random.Generator) -> dict[str, Any]:
+def _camera(truth: Truth, rng: np.random.Generator) -> dict[str, Any]:
     preset, lens = truth.preset.camera, truth.camera.lens
     focal = lens.focal * (1 + preset.factory_focal_off * rng.choice((-1.0, 1.0)))
     centre = lens.centre + preset.factory_centre_off_px * rng.choice((-1.0, 1.0), 2)
-    return {
+    factory = {
         "focal_px": _rounded(focal, 2),
         "centre_px": _rounded(centre, 2),
         "distortion": _rounded(lens.distortion * preset.factory_distortion_factor, 6),
     }
+    return {"driver": "sim", "image_size_px": list(preset.size_px), "factory": factory}
+
+
+def _table(preset: Preset, height: float) -> dict[str, Any]:
+    return {"touched_height_m": round(height, 5), "area_m": list(preset.table.area_m)}
 
 
 def _projector(preset: Preset) -> dict[str, Any]:

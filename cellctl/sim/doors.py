@@ -19,8 +19,8 @@ from cellctl.sim import requests as form
 from cellctl.sim.grid import Grid, describe
 from cellctl.sim.motion import TICK_S, Limits
 from cellctl.sim.optics import Renderer
+from cellctl.sim.pace import Pace
 from cellctl.sim.robot import Reading
-from cellctl.sim.time import Pace
 from cellctl.sim.world import Exposure, World
 
 Answer = tuple[dict[str, Any], bytes]
@@ -143,10 +143,8 @@ async def robot_wait(session: Session, request: form.RobotWait) -> Answer:
     world, pace = session.cell.world, session.cell.pace
 
     def settles_at() -> float:
-        reading = world.arm.read(world.now)
-        if reading.fault or reading.standstill_s >= request.standstill_s:
-            return max(world.now, world.arm.moving_until())
-        return max(world.now + TICK_S, world.arm.moving_until())
+        settled = world.arm.read(world.now).standstill_s >= request.standstill_s
+        return max(world.arm.moving_until(), world.now + (0.0 if settled else TICK_S))
 
     await pace.wait(settles_at, pace.now() + request.timeout_s)
     return _state(world.arm.read(world.now)), b""

@@ -13,8 +13,8 @@ from cellctl.config import CellConfig
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, Path, RobotState, Target
 from cellctl.errors import BadInput, DeviceFault
 from cellctl.geometry import Transform
+from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.link import ANSWER_S, Link, SimClock
-from cellctl.sim.server import Endpoint
 
 SLICE_S = 0.05
 """Cell time of one wait for the arm; what a stop may have to wait for."""

@@ -7,20 +7,17 @@ behind is never taken for a living one.
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import json
 import os
 import select
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields
 from pathlib import Path
 
 from cellctl.config import SimulationSection
 from cellctl.errors import BadInput, DeviceFault
-from cellctl.sim.server import SCHEMA, Endpoint, lock_file
+from cellctl.sim.endpoint import Endpoint, lives, read_endpoint
 
 READY_S = 60.0
 STOP_S = 10.0
@@ -46,7 +43,7 @@ def connect_or_start(simulation: SimulationSection, data_dir: Path) -> Endpoint:
     """
     path = endpoint_file(data_dir)
     data_dir.mkdir(parents=True, exist_ok=True)
-    running = _await_endpoint(path) if _is_locked(path) else None
+    running = _await_endpoint(path) if lives(path) else None
     if running is None:
         return _start(simulation, path, data_dir / "world.log")
     wanted = (simulation.preset, simulation.seed, simulation.time)
@@ -67,7 +64,7 @@ def stop_world(data_dir: Path) -> bool:
 
 def stop_endpoint(path: Path) -> bool:
     """As `stop_world`, of the world that serves on the endpoint file `path`."""
-    endpoint = _await_endpoint(path) if _is_locked(path) else None
+    endpoint = _await_endpoint(path) if lives(path) else None
     if endpoint is None:
         return False
     for number in (signal.SIGTERM, signal.SIGKILL):
@@ -76,18 +73,6 @@ def stop_endpoint(path: Path) -> bool:
         if _await_end(path):
             return True
     raise DeviceFault(f"the simulated cell (process {endpoint.pid}) does not end")
-
-
-def read_endpoint(path: Path) -> Endpoint:
-    """BadInput when the file is missing or not an endpoint file of this version."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        values = {field.name: document[field.name] for field in fields(Endpoint)}
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise BadInput(f"{path}: not the endpoint file of a simulated cell: {error!r}") from None
-    if values["schema"] != SCHEMA:
-        raise BadInput(f"{path}: its schema is {values['schema']!r}, not {SCHEMA!r}")
-    return Endpoint(**values)
 
 
 def _start(simulation: SimulationSection, path: Path, log: Path) -> Endpoint:
@@ -130,26 +115,14 @@ def _tail(log: Path) -> str:
     return lines[-1] if lines else "(empty)"
 
 
-def _is_locked(path: Path) -> bool:
-    """Whether a living world holds the lock."""
-    try:
-        with lock_file(path).open("r+") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except BlockingIOError:
-        return True
-    return False
-
-
 def _await_endpoint(path: Path) -> Endpoint | None:
     """The endpoint of a world that holds the lock, which may just be starting or ending."""
     deadline = time.monotonic() + READY_S
-    while _is_locked(path):
+    while lives(path):
         if path.exists():
             return read_endpoint(path)
         if time.monotonic() > deadline:
-            raise DeviceFault(f"a simulated cell holds {lock_file(path)} but does not answer")
+            raise DeviceFault(f"a simulated cell holds the lock of {path} but does not answer")
         time.sleep(POLL_S)
     return None
 
@@ -157,7 +130,7 @@ def _await_endpoint(path: Path) -> Endpoint | None:
 def _await_end(path: Path) -> bool:
     deadline = time.monotonic() + STOP_S
     while time.monotonic() < deadline:
-        if not _is_locked(path):
+        if not lives(path):
             return True
         time.sleep(POLL_S)
     return False

@@ -32,8 +32,8 @@ class Picture:
         """(h, w) float32 of linear light, 1 = white."""
         image = self.image
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        table = (np.arange(256) / 255.0) ** GAMMA
-        return table.astype(np.float32)[grey]
+        table = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
+        return cv2.LUT(grey, table)
 
 
 Light = tuple[tuple[float, Picture | None], ...]

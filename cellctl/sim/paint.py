@@ -36,6 +36,9 @@ BINNING = 4
 interpolated linearly: at the steepest board that can be read that is off by 0.002 pixels."""
 REGION_CAP = 900_000
 """A board that covers more camera pixels than this is not supersampled: it is large enough."""
+STRIP = 16
+COVER_REACH = 2.0
+"""Coarse pixels around a silhouette in which its soft edge can lie."""
 SIDE_LIGHT = 0.4
 """Share of the room's light on what faces down; it grows to 1 on what faces up."""
 WIDEST_RAY = 1.5
@@ -48,14 +51,14 @@ BeamFor = Callable[[str], tuple[Region, Array]]
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
-    """Part of a body's surface, every `BINNING` pixels of the region `small` of the binned
-    picture; all arrays (h, w) float32."""
+class Surface:
+    """What is seen of a body, every `BINNING` pixels of `region` (in these units). Layers, all
+    (h, w) float32: depth; radiance by the room's light; when the projector shines, radiance by
+    its white, and the projector pixel (u, v) that lights the place."""
 
-    small: Region
-    rays: Rays
+    region: Region
     margin: Array
-    depth: Array
+    layers: dict[str, Array]
 
 
 @dataclass(eq=False)
@@ -72,7 +75,7 @@ class Painter:
     def __init__(self, truth: Truth, view: View) -> None:
         self._truth, self._view = truth, view
         self._coarse = View(truth.camera.lens, BINNING)
-        self._room, self._coarse_room = room_light(truth, view), room_light(truth, self._coarse)
+        self._room = room_light(truth, self._coarse)
         self._textures = {name: texture(name, truth.preset.boards) for name in truth.boards}
         camera = truth.camera.pose.inverse()
         self._up = camera.rotation[:, 2].astype(np.float32)
@@ -91,89 +94,122 @@ class Painter:
 
     def _plate(self, canvas: Canvas, body: Body, plate: Plate, beam: BeamFor | None) -> None:
         """The tray, plain; a board, with what is printed on it."""
-        region = self._coarse.region_of(plate.hull())
-        if not region:
+        around = self._coarse.region_of(plate.hull())
+        if not around:
             return
         board = self._truth.boards.get(body.name)
-        rays = self._coarse.rays[region.slices]
+        rays = self._coarse.rays[around.slices]
         x, y, depth = board_hit(board, plate.pose, rays) if board else on_plane(plate.pose, rays)
-        scale = board.scale if board else 1.0
-        margin = plate.margin(x * np.float32(scale), y * np.float32(scale), depth)
-        found = bounding(margin >= 0).grown(2, margin.shape)
-        part = found.slices
-        patch = Patch(found.moved(region.left, region.top), rays[part], margin[part], depth[part])
-        full = patch.small.times(BINNING).cropped(canvas.grey.shape)
-        if not full:
+        scale = np.float32(board.scale if board else 1.0)
+        margin = plate.margin(x * scale, y * scale, depth)
+        found = bounding(margin >= 0)
+        if not found:
             return
-        normal = plate.normal()
-        light = self._room_on(normal) * self._room[full.slices]
-        if beam is not None:
-            strength, u, v = self._beam_geometry(patch.rays, patch.depth, normal)
-            strength, u, v = (_finer(a, BINNING)[_inside(full)] for a in (strength, u, v))
-            light += strength * _light_at(u, v, *beam(body.group))
+        found = found.grown(2, margin.shape)
+        region, part = found.moved(around.left, around.top), found.slices
+        hits = Hits(margin[part], depth[part], plate.normal())
+        white = np.array(WHITE * body.albedo, np.float32)
+        room = white * self._room[region.slices]
+        layers = self._layers(rays[part], hits, white, room, lit=beam is not None)
+        surface = Surface(region, hits.margin, layers)
+        printed = None
         if board:
-            light *= self._printed(self._textures[board.name], x[part], y[part], patch.depth)[
-                _inside(full)
-            ]
-        light *= np.float32(WHITE * body.albedo)
-        self._lay(canvas, full, patch, light)
+            printed = self._printed(self._textures[board.name], x[part], y[part], depth[part])
+        self._lay(canvas, surface, beam(body.group) if beam else None, printed)
 
     def _arm(
         self, canvas: Canvas, placed: Sequence[tuple[Body, Capsule]], beam: BeamFor | None
     ) -> None:
-        """All round bodies, merged into one patch before they are laid onto the picture."""
+        """All round bodies, merged into one surface before they are laid onto the picture."""
         shapes = Capsules.of([capsule for _, capsule in placed])
         tiles = self._coarse.tiles_of(shapes)
         if not len(tiles.row):
             return
         hits = meet(shapes[tiles.body], tiles.rays)
-        albedo = np.array([WHITE * body.albedo for body, _ in placed], np.float32)[tiles.body]
-        room = tiled(self._coarse_room)[tiles.row, tiles.column]
-        layers = {
-            "depth": hits.depth,
-            "room": albedo[:, None, None] * self._room_on(hits.normal) * room,
-        }
-        if beam is not None:
-            strength, u, v = self._beam_geometry(tiles.rays, hits.depth, hits.normal)
-            layers |= {"strength": albedo[:, None, None] * strength, "u": u, "v": v}
-        margin, merged = self._merged(tiles, hits, layers)
-        small = _around(tiles.row, tiles.column)
-        full = small.times(BINNING).cropped(canvas.grey.shape)
-        merged = {k: v[small.slices] for k, v in merged.items()}
-        light = _finer(merged["room"], BINNING)[_inside(full)]
-        if beam is not None:
-            strength, u, v = (
-                _finer(merged[k], BINNING)[_inside(full)] for k in ("strength", "u", "v")
-            )
-            light += strength * _light_at(u, v, *beam("arm"))
-        patch = Patch(small, self._coarse.rays[small.slices], margin[small.slices], merged["depth"])
-        self._lay(canvas, full, patch, light)
+        white = np.array([WHITE * body.albedo for body, _ in placed], np.float32)
+        white = white[tiles.body][:, None, None]
+        room = white * tiled(self._room)[tiles.row, tiles.column]
+        layers = self._layers(tiles.rays, hits, white, room, lit=beam is not None)
+        surface = self._merged(tiles, hits.margin, layers)
+        self._lay(canvas, surface, beam("arm") if beam else None, None)
 
-    def _merged(
-        self, tiles: Tiles, hits: Hits, layers: dict[str, Array]
-    ) -> tuple[Array, dict[str, Array]]:
+    def _layers(
+        self, rays: Rays, hits: Hits, white: Array, room: Array, *, lit: bool
+    ) -> dict[str, Array]:
+        """Layers of a surface that radiates `white` under light of strength 1, and `room` under
+        the room's light from above."""
+        layers = {"depth": hits.depth, "room": self._room_on(hits.normal) * room}
+        if lit:
+            strength, u, v = self._beam_geometry(rays, hits.depth, hits.normal)
+            layers |= {"white": white * strength, "u": u, "v": v}
+        return layers
+
+    def _merged(self, tiles: Tiles, margins: Array, layers: dict[str, Array]) -> Surface:
+        """One surface of many: the nearest where they overlap, the innermost beside them."""
         margin = np.full(self._coarse.padded, OUTSIDE, np.float32)
-        merged = {k: np.zeros(self._coarse.padded, np.float32) for k in layers}
-        merged["depth"][:] = 1.0
+        merged = {name: np.ones(self._coarse.padded, np.float32) for name in layers}
         for body in np.unique(tiles.body):
             mine, row, column = tiles.of(body)
-            m, d = hits.margin[mine], hits.depth[mine]
-            bm, bd = tiled(margin)[row, column], tiled(merged["depth"])[row, column]
-            front = np.where((m >= 0) & (bm >= 0), d < bd, m > bm)
-            tiled(margin)[row, column] = np.maximum(m, bm)
-            for k, picture in merged.items():
+            behind = tiled(margin)[row, column]
+            nearer = layers["depth"][mine] < tiled(merged["depth"])[row, column]
+            both = (margins[mine] >= 0) & (behind >= 0)
+            front = np.where(both, nearer, margins[mine] > behind)
+            tiled(margin)[row, column] = np.maximum(margins[mine], behind)
+            for name, picture in merged.items():
                 before = tiled(picture)[row, column]
-                tiled(picture)[row, column] = np.where(front, layers[k][mine], before)
-        return margin, merged
+                tiled(picture)[row, column] = np.where(front, layers[name][mine], before)
+        (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in (tiles.row, tiles.column))
+        region = Region(int(left), int(top), int(right), int(bottom)).times(TILE)
+        cut = {name: picture[region.slices] for name, picture in merged.items()}
+        return Surface(region, margin[region.slices], cut)
 
-    def _lay(self, canvas: Canvas, full: Region, patch: Patch, colour: Array) -> None:
-        """Lay a patch onto the picture where it is in front."""
-        margin, depth = (_finer(a, BINNING)[_inside(full)] for a in (patch.margin, patch.depth))
-        cover = np.clip(margin * np.float32(0.5 / self._view.pixel) + np.float32(0.5), 0, 1)
-        grey, before = canvas.grey[full.slices], canvas.depth[full.slices]
-        cover *= depth < before
-        grey += cover * (colour - grey)
-        np.copyto(before, depth, where=cover > 0.5)
+    def _lay(
+        self,
+        canvas: Canvas,
+        surface: Surface,
+        beam: tuple[Region, Array] | None,
+        printed: Array | None,
+    ) -> None:
+        """Lay a surface onto the picture, at full resolution, where it is in front.
+
+        In strips: what a slanting arm does not cover is left alone, and caches are not overrun.
+        """
+        layers = {name: _rimmed(layer) for name, layer in surface.layers.items()}
+        layers["margin"] = _rimmed(surface.margin)
+        covered = surface.margin > -COVER_REACH * self._coarse.pixel
+        for top in range(0, len(covered), STRIP):
+            strip = bounding(covered[top : top + STRIP]).moved(0, top)
+            if strip:
+                self._lay_strip(canvas, surface.region, strip, layers, beam, printed)
+
+    def _lay_strip(
+        self,
+        canvas: Canvas,
+        region: Region,
+        strip: Region,
+        layers: dict[str, Array],
+        beam: tuple[Region, Array] | None,
+        printed: Array | None,
+    ) -> None:
+        """Of `_lay`: the part `strip` of `region`, both in coarse pixels."""
+        full = strip.moved(region.left, region.top).times(BINNING).cropped(canvas.grey.shape)
+        inside = (slice(0, full.bottom - full.top), slice(0, full.right - full.left))
+        fine = {name: _finer(layer, strip)[inside] for name, layer in layers.items()}
+        colour = fine["room"]
+        if beam is not None:
+            colour += fine["white"] * _light_at(fine["u"], fine["v"], *beam)
+        if printed is not None:
+            colour *= printed[strip.times(BINNING).slices][inside]
+        cover = fine["margin"]
+        cover *= np.float32(0.5 / self._view.pixel)
+        cover += np.float32(0.5)
+        np.clip(cover, 0, 1, out=cover)
+        grey, behind = canvas.grey[full.slices], canvas.depth[full.slices]
+        cover *= fine["depth"] < behind
+        colour -= grey
+        colour *= cover
+        grey += colour
+        np.copyto(behind, fine["depth"], where=cover > 0.5)
 
     def _printed(self, printed: Texture, x: Array, y: Array, depth: Array) -> Array:
         """Reflectance (h, w) float32 at the camera's resolution."""
@@ -181,14 +217,16 @@ class Painter:
         fine = 2 if pixels <= REGION_CAP else 1
         level = printed.level_for(float(np.median(depth)) * self._view.pixel / fine)
         places = printed.places(x, y, level)
-        sample = printed.sample(_finer(places, BINNING * fine), level)
+        whole = Region(0, 0, *depth.shape[::-1])
+        fine_places = [_finer(_rimmed(a), whole, BINNING * fine) for a in places]
+        sample = printed.sample(fine_places[0], fine_places[1], level)
         sigma = self._truth.preset.camera.defocus_px * fine
         blurred = cv2.GaussianBlur(sample, (0, 0), sigma)
         size = (depth.shape[0] * BINNING, depth.shape[1] * BINNING)
         return _resized(blurred, size, cv2.INTER_AREA) * np.float32(1 / 255)
 
     def _room_on(self, normal: Normal) -> Array:
-        """Room light on surfaces with a normal in the camera's frame; 1 from above."""
+        """Room light on surfaces with a normal in the camera's frame."""
         up = sum(n * u for n, u in zip(normal, self._up, strict=True))
         rise = np.float32(AMBIENT * (1 - SIDE_LIGHT) / 2)
         return rise * up + np.float32(AMBIENT * (1 + SIDE_LIGHT) / 2)
@@ -196,8 +234,8 @@ class Painter:
     def _beam_geometry(
         self, rays: Rays, depth: Array, normal: Normal
     ) -> tuple[Array, Array, Array]:
-        """For points at `depth` along rays: how strongly white light falls on them, and the
-        projector pixel (u, v) that lights them."""
+        """For points at `depth` along rays: how strongly the projector's white falls on them,
+        and the projector pixel (u, v) that lights them."""
         points = (depth * rays.x, depth * rays.y, depth)
         away = [lamp - p for lamp, p in zip(self._lamp, points, strict=True)]
         square = sum(a * a for a in away)
@@ -233,30 +271,22 @@ def _light_at(u: Array, v: Array, region: Region, light: Array) -> Array:
     """The projector's picture, of which `light` is the part `region`, at its pixels (u, v)."""
     if not region:
         return np.zeros_like(u)
-    flat = (len(u), -1)  # of tiles: OpenCV refuses pictures of more than 32767 rows
-    columns = (u - np.float32(region.left)).reshape(flat)
-    rows = (v - np.float32(region.top)).reshape(flat)
-    return cv2.remap(light, columns, rows, cv2.INTER_LINEAR).reshape(u.shape)
+    columns, rows = u - np.float32(region.left), v - np.float32(region.top)
+    return cv2.remap(light, columns, rows, cv2.INTER_LINEAR)
 
 
-def _finer(values: Array, n: int) -> Array:
-    """(h n, w n, ...) from (h, w, ...) given at the middles of blocks; linear also at the rim."""
-    edge = [(1, 1), (1, 1)] + [(0, 0)] * (values.ndim - 2)
-    padded = np.pad(values, edge, mode="reflect", reflect_type="odd")
-    fine = cv2.resize(padded, None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
+def _rimmed(values: Array) -> Array:
+    """With a rim of one more value on every side, continued linearly."""
+    return np.pad(values, 1, mode="reflect", reflect_type="odd")
+
+
+def _finer(rimmed: Array, part: Region, n: int = BINNING) -> Array:
+    """What is given at the middles of n x n blocks, at every pixel of the blocks of `part`."""
+    around = rimmed[part.top : part.bottom + 2, part.left : part.right + 2]
+    fine = cv2.resize(around, None, fx=n, fy=n, interpolation=cv2.INTER_LINEAR)
     return fine[n:-n, n:-n]
-
-
-def _inside(full: Region) -> tuple[slice, slice]:
-    return slice(0, full.bottom - full.top), slice(0, full.right - full.left)
 
 
 def _resized(picture: Array, shape: tuple[int, int], how: int = cv2.INTER_LINEAR) -> Array:
     resized: Array = cv2.resize(picture, (shape[1], shape[0]), interpolation=how)
     return resized
-
-
-def _around(rows: Array, columns: Array) -> Region:
-    """The smallest region of a view's pixels that holds tiles."""
-    (top, bottom), (left, right) = ((a.min(), a.max() + 1) for a in (rows, columns))
-    return Region(int(left), int(top), int(right), int(bottom)).times(TILE)

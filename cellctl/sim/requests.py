@@ -82,7 +82,7 @@ class RobotStop(Request):
 
 class RobotWait(Request):
     """Wait until the arm is not commanded to move and all measured joint speeds have been zero
-    for `standstill_s`, or it has a fault, or `timeout_s` of cell time have passed."""
+    for `standstill_s`, or `timeout_s` of cell time have passed."""
 
     standstill_s: Seconds
     timeout_s: Seconds

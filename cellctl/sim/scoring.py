@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cellctl.geometry import Array
+from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.link import Link
-from cellctl.sim.server import Endpoint
 
 
 class Scorer:

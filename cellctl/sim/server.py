@@ -1,4 +1,4 @@
-"""The process around a world: three doors on loopback, one render thread, one lock.
+"""The process around a world: three doors on loopback and one render thread.
 
 It outlives whoever started it, as a real cell does, and ends on SIGTERM or when nobody has been
 connected for a while.
@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
-import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -22,32 +20,18 @@ from typing import Any, Literal
 
 import structlog
 
-from cellctl.errors import BadInput, Busy, CellctlError
+from cellctl.errors import BadInput, CellctlError
 from cellctl.sim.doors import DOORS, Cell, Session, answer
+from cellctl.sim.endpoint import Endpoint, write_endpoint
 from cellctl.sim.optics import Renderer
+from cellctl.sim.pace import Paced, Stepped
 from cellctl.sim.presets import PRESETS
-from cellctl.sim.time import Paced, Stepped
 from cellctl.sim.truth import draw
 from cellctl.sim.wire import HOST, BrokenFrame, pack, read_frame
 from cellctl.sim.world import World
 
-SCHEMA = "cellctl-sim/1"
-LOCK_TRIES, LOCK_RETRY_S = 10, 0.05
+LINGER_S = 1.0
 log = structlog.get_logger("cellctl.sim")
-
-
-@dataclass(frozen=True)
-class Endpoint:
-    """Where a world can be reached, and which one it is; this is the endpoint file's content."""
-
-    pid: int
-    cell: int
-    truth: int
-    faults: int
-    preset: str
-    seed: int
-    time: str
-    schema: str = SCHEMA
 
 
 @dataclass(frozen=True)
@@ -79,7 +63,7 @@ class Server:
             loop.add_signal_handler(number, self._stop.set)
         doors = {door: await self._open(door) for door in DOORS}
         endpoint = self._endpoint(doors)
-        _write_atomically(self._settings.endpoint_file, endpoint)
+        write_endpoint(self._settings.endpoint_file, endpoint)
         try:
             ready(endpoint)
             log.info("serving", **asdict(endpoint))
@@ -166,6 +150,7 @@ class Server:
                 reply, pixels = {"error": {"code": error.code, "message": error.message}}, b""
                 if isinstance(error, BrokenFrame):
                     writer.write(self._frame(header, reply, pixels))
+                    await _drained(reader, writer)
                     return
             except (asyncio.IncompleteReadError, ConnectionError):
                 raise
@@ -206,26 +191,10 @@ class Server:
         return await loop.run_in_executor(self._thread, function, *args)
 
 
-@contextlib.contextmanager
-def only_one(endpoint_file: Path) -> Iterator[None]:
-    """Holds the lock beside the endpoint file; Busy when another world holds it."""
-    endpoint_file.parent.mkdir(parents=True, exist_ok=True)
-    with lock_file(endpoint_file).open("a") as lock:
-        for _ in range(LOCK_TRIES):  # somebody who looks whether a world runs holds it briefly
-            with contextlib.suppress(OSError):
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            time.sleep(LOCK_RETRY_S)
-        else:
-            raise Busy(f"a simulated cell runs already on {endpoint_file}")
-        yield
-
-
-def lock_file(endpoint_file: Path) -> Path:
-    return endpoint_file.with_name(endpoint_file.name + ".lock")
-
-
-def _write_atomically(path: Path, endpoint: Endpoint) -> None:
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(asdict(endpoint)) + "\n", encoding="utf-8")
-    temporary.replace(path)
+async def _drained(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Close our side and wait a little for the other one: a hard close would lose the reply."""
+    writer.write_eof()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LINGER_S):
+            while await reader.read(1 << 16):
+                pass

@@ -13,7 +13,7 @@ from cellctl.geometry import Array
 from cellctl.sim.noise import keyed
 from cellctl.sim.region import NOWHERE, Region
 from cellctl.sim.truth import Truth
-from cellctl.sim.view import ONE_MAP, TILE, View, dense
+from cellctl.sim.view import TILE, View, dense
 
 AMBIENT, PROJECTOR = 0.55, 0.45
 """What a white sheet reflects of the room's and of the projector's light; 1 saturates."""
@@ -60,15 +60,14 @@ class Tabletop:
             np.float32(WHITE * AMBIENT) * room_light(truth, view) * albedo + self._glare()
         )
         self.gain = np.float32(WHITE * PROJECTOR) * albedo * strength
-        self._pixels = np.dstack([u, v])
-        self._maps = cv2.convertMaps(self._pixels, ONE_MAP, cv2.CV_16SC2)
+        self._maps = u, v
         self.defocus = self._defocus()
 
     def lit(self, smooth: Array, region: Region | None = None) -> Array:
         """Radiance of the table under the light `smooth` (projector h, w), of a camera region."""
         part = (slice(None), slice(None)) if region is None else region.slices
-        first, second = (m[part] for m in self._maps)
-        light: Array = cv2.remap(smooth, first, second, cv2.INTER_LINEAR)
+        u, v = (m[part] for m in self._maps)
+        light: Array = cv2.remap(smooth, u, v, cv2.INTER_LINEAR)
         light *= self.gain[part]
         light += self.ambient[part]
         return light
@@ -127,8 +126,11 @@ class Tabletop:
         """
         middle = self._truth.camera.project(self._truth.table.pose.translation)
         column, row = middle.astype(int)
-        step = self._pixels[row : row + 2, column : column + 2].astype(float)
-        scale = np.sqrt(abs(np.linalg.det([step[0, 1] - step[0, 0], step[1, 0] - step[0, 0]])))
+        steps = [
+            [m[row, column + 1] - m[row, column], m[row + 1, column] - m[row, column]]
+            for m in self._maps
+        ]
+        scale = np.sqrt(abs(np.linalg.det(np.array(steps, dtype=float))))
         return float(
             scale * np.hypot(self._truth.preset.camera.defocus_px, PIXEL_BOX_VARIANCE**0.5)
         )

@@ -14,7 +14,6 @@ import numpy as np
 from cellctl.errors import BadInput
 from cellctl.geometry import Array
 from cellctl.sim.presets import BoardPreset
-from cellctl.sim.view import ONE_MAP
 
 INK, PAPER = 0.05, 0.85
 DICTIONARY = "DICT_4X4_50"
@@ -38,19 +37,20 @@ class Texture:
         level = int(np.floor(np.log2(max(step / self.texel, 1.0))))
         return min(level, len(self.levels) - 1)
 
-    def places(self, x: Array, y: Array, level: int) -> Array:
-        """Texel coordinates (..., 2) float32 of nominal board coordinates, (...,) each."""
+    def places(self, x: Array, y: Array, level: int) -> tuple[Array, Array]:
+        """Texel coordinates (columns, rows) float32 of nominal board coordinates."""
         scale = 1.0 / (self.texel * 2**level)
         columns, rows = (
             a * np.float32(scale) - np.float32(corner * scale + 0.5)
             for a, corner in zip((x, y), self.origin, strict=True)
         )
-        return np.stack([columns, rows], axis=-1)
+        return columns, rows
 
-    def sample(self, places: Array, level: int) -> Array:
-        """(h, w) uint8 at texel coordinates (h, w, 2); paper beside the sheet."""
-        white = PAPER * 255.0
-        return cv2.remap(self.levels[level], places, ONE_MAP, cv2.INTER_LINEAR, borderValue=white)
+    def sample(self, columns: Array, rows: Array, level: int) -> Array:
+        """uint8 at texel coordinates (h, w) each; paper beside the sheet."""
+        return cv2.remap(
+            self.levels[level], columns, rows, cv2.INTER_LINEAR, borderValue=PAPER * 255.0
+        )
 
 
 def description(name: str, preset: BoardPreset) -> dict[str, object]:

@@ -266,9 +266,10 @@ def _centre_at(pose: Array, centre: Array, place: tuple[float, float, float]) ->
 
 
 def tape_error(preset: Preset, pose: Array, rng: Rng) -> Array:
-    """A pose as a tape measure gives it: off by up to `tape_off_m` and `tape_off_deg`."""
-    shift = _direction(rng) * rng.uniform(0.0, preset.tape_off_m)
-    turn = _direction(rng) * np.radians(rng.uniform(0.0, preset.tape_off_deg))
+    """A pose as a tape measure gives it: off by up to `tape_off_m` and `tape_off_deg`, less what
+    rounding it to millimetres and tenths of degrees may add."""
+    shift = _direction(rng) * rng.uniform(0.0, 0.99 * preset.tape_off_m)
+    turn = _direction(rng) * np.radians(rng.uniform(0.0, 0.99 * preset.tape_off_deg))
     off = pose.copy()
     off[:3, :3] = pose_matrix(turn, (0, 0, 0))[:3, :3] @ pose[:3, :3]
     off[:3, 3] = pose[:3, 3] + shift

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 
 from cellctl.geometry import Array
 from cellctl.sim.lens import Lens
@@ -23,11 +23,11 @@ from cellctl.sim.region import NOWHERE, Region
 TILE = 16
 NEAR_M = 0.01
 OUTSIDE = -1.0
+GRAZING = 1e-5
+"""Rays that rise less than this over a plane are taken to rise this much."""
 """What is nearer than this to a lens's plane is not seen."""
 GRID_STEP_PX = 32
 Normal = tuple[Array, Array, Array]
-ONE_MAP = np.empty((0, 0), dtype=np.float32)
-"""OpenCV's second map, for when the first holds both coordinates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,14 +152,18 @@ def dense(function: Callable[[Array], Array], shape: tuple[int, int], step: int)
 
     Evaluated every `step` pixels at most; exact to the fourth order between.
     """
-    rows, columns = (np.linspace(0, n - 1, -(-n // step) + 1) for n in shape)
+    rows, columns = (np.linspace(0, n - 1, max(-(-n // step), 3) + 1) for n in shape)
     values = function(np.stack(np.meshgrid(columns, rows), axis=-1))
-    full = np.empty((values.shape[-1], *shape), dtype=np.float32)
-    for layer, value in zip(full, np.moveaxis(values, -1, 0), strict=True):
-        layer[:] = RectBivariateSpline(rows, columns, value)(
-            np.arange(shape[0]), np.arange(shape[1])
-        )
-    return full
+    down, across = (_weights(nodes, n) for nodes, n in zip((rows, columns), shape, strict=True))
+    layers = [down @ value @ across.T for value in np.moveaxis(values, -1, 0)]
+    return np.array(layers, dtype=np.float32)
+
+
+def _weights(nodes: Array, count: int) -> Array:
+    """(count, len(nodes)): how the cubic spline through values at `nodes` depends on them, at
+    0, 1, ... count - 1."""
+    weights: Array = make_interp_spline(nodes, np.eye(len(nodes)), k=3)(np.arange(count))
+    return weights
 
 
 class View:
@@ -215,8 +219,9 @@ def tiled(picture: Array) -> Array:
 def on_plane(pose: Array, rays: Rays) -> tuple[Array, Array, Array]:
     """Where rays meet the plane z = 0 of `pose` (4, 4): x and y there, depth."""
     x_axis, y_axis, normal, origin = pose[:3].T
-    with np.errstate(divide="ignore"):
-        depth = np.float32(normal @ origin) / rays.dot(normal)
+    slope = rays.dot(normal)
+    np.copyto(slope, np.float32(GRAZING), where=np.abs(slope) < GRAZING)
+    depth = np.float32(normal @ origin) / slope
     x = depth * rays.dot(x_axis) - np.float32(x_axis @ origin)
     y = depth * rays.dot(y_axis) - np.float32(y_axis @ origin)
     return x, y, depth

@@ -27,8 +27,11 @@ class BrokenFrame(BadInput):
 
 
 def pack(header: dict[str, Any], blob: bytes = b"") -> bytes:
-    """One frame."""
-    text = json.dumps(header, allow_nan=False).encode()
+    """One frame. BadInput when it would be refused."""
+    try:
+        text = json.dumps(header, allow_nan=False).encode()
+    except ValueError:
+        raise BadInput(f"{header.get('verb')}: a number is not finite") from None
     if len(text) > MAX_HEADER or len(blob) > MAX_BLOB:
         raise BadInput(_too_long(len(text), len(blob)))
     return LENGTHS.pack(len(text), len(blob)) + text + blob
