@@ -1,0 +1,147 @@
+"""What a hand-eye solution says, and when it may be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cellctl.calib.camera import CameraModel
+from cellctl.calib.hand_eye_choice import Candidate
+from cellctl.calib.hand_eye_fit import Mount
+from cellctl.calib.views import Rejection
+from cellctl.geometry import Array, Transform
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeView:
+    """One used view. `off_mm`, `off_deg`: between where its picture alone and where the chain
+    has the board."""
+
+    id: str
+    rms_px: float
+    held_out_px: float
+    off_mm: float
+    off_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeResult:
+    """`camera_pose` is T_base_camera or T_flange_camera, `board_pose` T_flange_board or
+    T_base_board. `covariance` (12, 12) is that of small turns (rad) and shifts (m) of both, each
+    in its own child frame. `candidates` are all ways that were tried; `why` says why `chosen`.
+    """
+
+    mount: Mount
+    camera: CameraModel
+    camera_pose: Transform
+    board_pose: Transform
+    covariance: Array
+    chosen: str
+    why: str
+    candidates: tuple[Candidate, ...]
+    scale: float
+    warp: Array
+    robot_sigma: Array
+    axis_scatter_deg: Array
+    rms_px: float
+    held_out_px: float
+    held_out_used_px: float
+    views: tuple[HandEyeView, ...]
+    rejected: tuple[Rejection, ...]
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """In words of the workshop: how far pictures and robot disagree about the board."""
+        mm = np.array([view.off_mm for view in self.views])
+        deg = np.array([view.off_deg for view in self.views])
+        sigma = np.sqrt(self.covariance.diagonal())
+        return {
+            "spread_rms_mm": float(np.sqrt(np.mean(mm**2))),
+            "spread_max_mm": float(mm.max()),
+            "spread_rms_deg": float(np.sqrt(np.mean(deg**2))),
+            "camera_sigma_mm": float(1e3 * np.linalg.norm(sigma[3:6])),
+            "camera_sigma_deg": float(np.degrees(np.linalg.norm(sigma[:3]))),
+            "robot_sigma_mm": float(1e3 * self.robot_sigma[3]),
+            "robot_sigma_deg": float(np.degrees(self.robot_sigma[0])),
+            "board_scale": self.scale,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form, as `cellctl solve --json` prints it."""
+        poses = (self.camera_pose, self.board_pose)
+        return {
+            "mount": self.mount,
+            "views": {
+                "used": [view.id for view in self.views],
+                "rejected": [r.to_dict() for r in self.rejected],
+            },
+            "rms_px": self.rms_px,
+            "held_out_px": self.held_out_px,
+            "held_out_used_px": self.held_out_used_px,
+            "camera": self.camera.to_dict(),
+            **{f"T_{pose.parent}_{pose.child}": pose.to_list() for pose in poses},
+            "method": self.chosen,
+            "why": self.why,
+            "candidates": {
+                c.option.name: {"rms_px": c.rms_px, "held_out_px": c.held_out_px}
+                for c in self.candidates
+            },
+            "summary": self.summary,
+            "axis_scatter_deg": self.axis_scatter_deg.tolist(),
+            "per_view": {
+                v.id: {
+                    "rms_px": v.rms_px,
+                    "held_out_px": v.held_out_px,
+                    "off_mm": v.off_mm,
+                    "off_deg": v.off_deg,
+                }
+                for v in self.views
+            },
+        }
+
+
+@dataclass(frozen=True)
+class HandEyeLimits:
+    """What hand-eye must reach to pass. The scatter of rotation axes: its smallest and its
+    second value, degrees."""
+
+    views: int = 5
+    held_out_px: float = 3.0
+    scatter_deg: tuple[float, float] = (10.0, 20.0)
+    rejected: float = 1.0 / 3.0
+    spread_mm: float = 5.0
+
+
+def judge(
+    result: HandEyeResult, limits: HandEyeLimits | None = None
+) -> tuple[str, tuple[str, ...]]:
+    """("pass" or "fail", reasons in words); a pass has no reasons."""
+    limits = limits or HandEyeLimits()
+    used, total = len(result.views), len(result.views) + len(result.rejected)
+    smallest, second, _ = result.axis_scatter_deg
+    reasons = []
+    if used < limits.views:
+        reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
+    if total - used > limits.rejected * total:
+        reasons.append(f"{total - used} of {total} views were rejected")
+    if smallest < limits.scatter_deg[0] or second < limits.scatter_deg[1]:
+        reasons.append(
+            f"the flange turned by {smallest:.0f}, {second:.0f} and "
+            f"{result.axis_scatter_deg[2]:.0f} degrees about three axes; at least "
+            f"{limits.scatter_deg[0]:.0f} and {limits.scatter_deg[1]:.0f} are needed about the "
+            "weaker two: add views tilted about other axes"
+        )
+    if not result.held_out_used_px <= limits.held_out_px:
+        reasons.append(
+            f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
+            f"{limits.held_out_px} px"
+        )
+    spread = result.summary["spread_rms_mm"]
+    if not spread <= limits.spread_mm:
+        reasons.append(
+            f"pictures and robot disagree about the board by {spread:.1f} mm, over the limit of "
+            f"{limits.spread_mm} mm"
+        )
+    return ("fail" if reasons else "pass"), tuple(reasons)
