@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 SEED   ?= 0
+SEEDS  ?= 0-9
+KILLS  ?= 30
 
 # One BLAS thread: results are the same to the last digit on one machine, and the solver child
 # does not fight the camera for two cores.
 export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
-.PHONY: help install demo test format lint types imports unit clean
+.PHONY: help install demo test format lint types imports unit clean \
+	format-fix soak-kill soak-demo soak-core bench-render
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -41,6 +44,21 @@ imports: install
 
 unit: install
 	$(BIN)/pytest
+
+soak-kill: install ## SIGKILL the daemon at KILLS random instants, resume, compare
+	$(BIN)/python -m tests.soak.kill --kills $(KILLS) --seed $(SEED)
+
+soak-demo: install ## The demo on SEEDS: verdicts, and rows beside the numeric model's
+	$(BIN)/python -m benchmarks.stages --seeds $(SEEDS)
+
+soak-core: install ## Kill the engine with a toy procedure KILLS times
+	CELLCTL_SOAK=$(KILLS) $(BIN)/pytest tests/core/test_crash.py
+
+bench-render: install ## Milliseconds a rendered picture
+	$(BIN)/python -m benchmarks.render
+
+format-fix: install ## Let ruff format
+	$(BIN)/ruff format
 
 clean: ## Remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

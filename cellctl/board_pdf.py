@@ -187,9 +187,9 @@ def _chessboard(board: Chessboard) -> Artwork:
 
 def _charuco(board: Charuco) -> Artwork:
     """Markers stand in the white squares."""
-    made = board.opencv()
-    corners = np.asarray(made.getObjPoints(), dtype=float).reshape(-1, 4, 3)[..., :2]
-    markers = _markers(np.asarray(made.getIds()).reshape(-1), corners, board.dictionary)
+    printed = board.layout.markers
+    corners = np.stack(list(printed.values()))
+    markers = _markers(np.array(list(printed)), corners, board.dictionary)
     white = {tuple(cell) for cell in np.floor(corners.mean(axis=1) / board.square_m).astype(int)}
     columns, rows = board.squares
     black = [(i, j) for j in range(rows) for i in range(columns) if (i, j) not in white]

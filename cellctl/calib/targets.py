@@ -151,10 +151,11 @@ class Charuco:
     @property
     def points(self) -> Array:
         """All crossings (n, 3), row by row."""
-        return np.column_stack([self._layout.corners, np.zeros(len(self._layout.corners))])
+        return np.column_stack([self.layout.corners, np.zeros(len(self.layout.corners))])
 
     @cached_property
-    def _layout(self) -> CharucoLayout:
+    def layout(self) -> CharucoLayout:
+        """Where crossings and markers are."""
         return CharucoLayout.of(
             self.squares, self.square_m, self.marker_m, self.dictionary, legacy=self.legacy
         )
@@ -162,13 +163,13 @@ class Charuco:
     @cached_property
     def profiles(self) -> Array:
         """Across the black borders of the markers."""
-        return across_borders(np.stack(list(self._layout.markers.values())), self._layout.modules)
+        return across_borders(np.stack(list(self.layout.markers.values())), self.layout.modules)
 
     def extent(self) -> tuple[Array, Array]:
         return np.zeros(2), np.array(self.squares) * self.square_m
 
     def detect(self, image: Any) -> Detection | None:
-        found = find_charuco(grey(image), self._layout)
+        found = find_charuco(grey(image), self.layout)
         if found is None:
             return None
         numbers, pixels = found
