@@ -10,7 +10,7 @@ import numpy as np
 
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.chain import FULL, PINHOLE, Chain, ChainState, Free, Sheet
-from cellctl.calib.pose import board_pose, on_a_line
+from cellctl.calib.pose import BoardPose, board_poses, on_a_line
 from cellctl.calib.schur import Solution, minimise
 from cellctl.calib.views import AnyView, Batch, Rejection, View, noise_px, rms
 from cellctl.errors import SolveError
@@ -20,9 +20,10 @@ MINIMUM_VIEWS = 3
 MINIMUM_POINTS = 6
 HUBER = 4.0
 """Residuals lose weight beyond so many standard deviations: 3e-4 of honest noise does."""
-FAR_BEYOND, FAR_SIGMAS = 3.0, 5.0
-"""A view is rejected when its error is that many times the median view's, and that many robust
-standard deviations above it."""
+FAR_BEYOND, FAR_SIGMAS, FAR_PX = 3.0, 5.0, 0.1
+"""A view is rejected when its error is that many times the median view's, that many robust
+standard deviations above it, and that many pixels."""
+NO_POSE = "no pose of the board explains the picture"
 FOCAL_GUESSES = (0.6, 1.0, 1.7, 3.0)
 """In longer sides of the picture, tried beside the closed form."""
 
@@ -61,6 +62,18 @@ class CameraFit:
         """Robust noise of a coordinate of a corner."""
         return self.chain.sigma_px
 
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (9,) of camera.vector, from the scatter of the errors."""
+        free = self.chain.free
+        errors = self.chain.errors(self.state)[self.chain.batch.seen]
+        redundancy = errors.size - free.count - 6 * len(self.names)
+        variance = np.square(errors).sum() / max(redundancy, 1) / self.sigma_px**2
+        count, sigma = len(free.intrinsics), np.zeros(9)
+        variances = self.solution.globals_covariance.diagonal()[:count]
+        sigma[list(free.intrinsics)] = np.sqrt(variance * variances)
+        return sigma
+
     def without(self, view: int) -> CameraFit:
         """Fitted again without one view, from here."""
         return self.over(np.arange(len(self.names)) != view)
@@ -70,7 +83,7 @@ class CameraFit:
         names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
         chain = self.chain.subset(keep)
         start = replace(self.state, corrections=self.state.corrections[keep])
-        return CameraFit(names, chain, minimise(chain, start, huber=HUBER, tolerance=1e-8))
+        return CameraFit(names, chain, minimise(chain, start, huber=HUBER, tolerance=1e-7))
 
 
 def fit_camera(
@@ -84,14 +97,17 @@ def fit_camera(
     SolveError when fewer than three views are left, or when no camera explains them.
     """
     usable, rejected = usable_views(views, minimum_points)
-    _require(usable, rejected)
-    fit = _fit(usable, image_size, option)
-    while (worst := _far_beyond(fit)) is not None:
-        place, reason = worst
-        rejected.append(Rejection(usable.pop(place).id, reason))
+    while True:
         _require(usable, rejected)
-        fit = _fit(usable, image_size, option)
-    return fit, sorted(rejected, key=lambda r: r.id)
+        camera, poses = _start(usable, image_size)
+        bad = {view.id: NO_POSE for view in usable if view.id not in poses}
+        if not bad:
+            fit = _fit(usable, camera, np.stack([poses[view.id] for view in usable]), option)
+            bad = _far_beyond(fit)
+        if not bad:
+            return fit, sorted(rejected, key=lambda r: r.id)
+        rejected += [Rejection(name, reason) for name, reason in bad.items()]
+        usable = [view for view in usable if view.id not in bad]
 
 
 def usable_views(views: Sequence[AnyView], minimum: int) -> tuple[list[AnyView], list[Rejection]]:
@@ -118,8 +134,9 @@ def _require(views: Sequence[View], rejected: Sequence[Rejection]) -> None:
         )
 
 
-def _fit(views: Sequence[View], image_size: tuple[int, int], option: CameraOption) -> CameraFit:
-    camera, poses = _start(views, image_size)
+def _fit(
+    views: Sequence[View], camera: CameraModel, poses: Array, option: CameraOption
+) -> CameraFit:
     ones = np.broadcast_to(np.eye(4), poses.shape)
     sheet = Sheet.of(np.concatenate([view.points for view in views]))
     chain = Chain(Batch.of(views), ones, ones, sheet, option.free)
@@ -131,23 +148,32 @@ def _fit(views: Sequence[View], image_size: tuple[int, int], option: CameraOptio
     return CameraFit(tuple(view.id for view in views), chain, solution)
 
 
-def _start(views: Sequence[View], image_size: tuple[int, int]) -> tuple[CameraModel, Array]:
-    """A pinhole and a pose for each view: Zhang's closed form, or a common focal length if noise
-    or one bad view spoils that; whichever explains the median view best."""
+def _start(
+    views: Sequence[View], image_size: tuple[int, int]
+) -> tuple[CameraModel, dict[str, Array]]:
+    """A pinhole, and T_camera_board by the ids of the views that it explains.
+
+    Zhang's closed form, or a common focal length if noise or one bad view spoils that; whichever
+    explains the median view best.
+    """
     guesses = _zhang(views, image_size) + [factor * max(image_size) for factor in FOCAL_GUESSES]
-    best, best_error = None, np.inf
-    for focal in guesses:
-        camera = _pinhole(focal, image_size)
-        try:
-            poses = [board_pose(view, camera) for view in views]
-        except SolveError:
-            continue
-        error = float(np.median([pose.rms_px for pose in poses]))
-        if error < best_error:
-            best, best_error = (camera, np.stack([pose.matrix for pose in poses])), error
-    if best is None:
+    cameras = [_pinhole(focal, image_size) for focal in guesses]
+    found = [{view.id: pose for view in views if (pose := _rough(view, c))} for c in cameras]
+    errors = [
+        float(np.median([poses[v.id].rms_px if v.id in poses else np.inf for v in views]))
+        for poses in found
+    ]
+    best = int(np.argmin(errors))
+    if not np.isfinite(errors[best]):
         raise SolveError("no pinhole camera explains the views of the board, not even roughly")
-    return best
+    return cameras[best], {name: pose.matrix for name, pose in found[best].items()}
+
+
+def _rough(view: View, camera: CameraModel) -> BoardPose | None:
+    try:
+        return board_poses(view, camera, refine=False)[0]
+    except SolveError:
+        return None
 
 
 def _zhang(views: Sequence[View], image_size: tuple[int, int]) -> list[float]:
@@ -164,14 +190,14 @@ def _pinhole(focal: float, image_size: tuple[int, int]) -> CameraModel:
     return CameraModel(K, np.zeros(5), image_size)
 
 
-def _far_beyond(fit: CameraFit) -> tuple[int, str] | None:
-    """The worst view and what is wrong with it, or None when all belong together."""
+def _far_beyond(fit: CameraFit) -> dict[str, str]:
+    """The worst view by its id and what is wrong with it; empty when all belong together."""
     errors, seen = fit.chain.errors(fit.state), fit.chain.batch.seen
     per_view = np.array([rms(e[s]) for e, s in zip(errors, seen, strict=True)])
     median = float(np.median(per_view))
     spread = 1.4826 * float(np.median(np.abs(per_view - median)))
     worst = int(np.argmax(per_view))
-    if per_view[worst] <= max(FAR_BEYOND * median, median + FAR_SIGMAS * spread):
-        return None
+    if per_view[worst] <= max(FAR_BEYOND * median, median + FAR_SIGMAS * spread, FAR_PX):
+        return {}
     reason = f"reprojection error {per_view[worst]:.2f} px; the median view has {median:.2f} px"
-    return worst, reason
+    return {fit.names[worst]: reason}

@@ -174,7 +174,7 @@ def _result(attempt: _Attempt, image_size: tuple[int, int]) -> IntrinsicResult:
     errors, seen, poses = fit.chain.errors(fit.state), fit.chain.batch.seen, fit.state.corrections
     return IntrinsicResult(
         camera=fit.camera,
-        sigma=_sigma(fit, errors[seen]),
+        sigma=fit.sigma,
         rms_px=rms(errors[seen]),
         held_out_px=rms(np.concatenate(list(held_out.values()))),
         held_out_used_px=rms(np.concatenate([held_out[name] for name in fit.names])),
@@ -186,16 +186,6 @@ def _result(attempt: _Attempt, image_size: tuple[int, int]) -> IntrinsicResult:
         coverage=_coverage(fit.chain.batch.pixels[seen], image_size),
         warp=fit.state.warp,
     )
-
-
-def _sigma(fit: CameraFit, errors: Array) -> Array:
-    """Standard deviations (9,) of the intrinsic parameters, from the scatter of the errors."""
-    free = list(fit.chain.free.intrinsics)
-    redundancy = errors.size - fit.chain.free.count - 6 * len(fit.names)
-    variance = np.square(errors).sum() / max(redundancy, 1) / fit.sigma_px**2
-    sigma = np.zeros(9)
-    sigma[free] = np.sqrt(variance * fit.solution.globals_covariance.diagonal()[: len(free)])
-    return sigma
 
 
 def _tilt(pose: Array) -> float:

@@ -93,12 +93,13 @@ def board_pose(view: View, camera: CameraModel) -> BoardPose:
     return board_poses(view, camera)[0]
 
 
-def board_poses(view: View, camera: CameraModel) -> list[BoardPose]:
-    """Both poses of a plane that its picture allows, the better one first.
+def board_poses(view: View, camera: CameraModel, *, refine: bool = True) -> list[BoardPose]:
+    """Both poses of a plane that its picture allows, the better one first; in closed form, or
+    refined to the least reprojection error.
 
     From far away the picture of a tilted board hardly changes when the tilt is mirrored, and
     the worse of the two may be the true one: T. Collins, A. Bartoli, Infinitesimal plane-based
-    pose estimation, 2014.
+    pose estimation, 2014. SolveError when the points lie on a line.
     """
     normalised = camera.normalise(view.pixels)
     if not np.isfinite(normalised).all() or on_a_line(view.points):
@@ -106,22 +107,25 @@ def board_poses(view: View, camera: CameraModel) -> list[BoardPose]:
     _, turns, shifts, _ = cv2.solvePnPGeneric(
         view.points, normalised, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
-    poses = [_refined(view, camera, *start) for start in zip(turns, shifts, strict=True)]
+    starts = zip(turns, shifts, strict=True)
+    poses = [_pose(view, camera, *(_refined(view, camera, *s) if refine else s)) for s in starts]
     sound = [pose for pose in poses if np.isfinite(pose.rms_px)]
     if not sound:
         raise SolveError(f"view {view.id!r}: no pose in front of the camera explains it")
     return sorted(sound, key=lambda pose: pose.rms_px)
 
 
-def _refined(view: View, camera: CameraModel, turn: Any, shift: Any) -> BoardPose:
+def _refined(view: View, camera: CameraModel, turn: Any, shift: Any) -> tuple[Any, Any]:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-12)
-    turn, shift = cv2.solvePnPRefineLM(
+    return cv2.solvePnPRefineLM(
         view.points, view.pixels, camera.K, camera.distortion, turn, shift, criteria
     )
+
+
+def _pose(view: View, camera: CameraModel, turn: Any, shift: Any) -> BoardPose:
     matrix = pose_matrix(turn, shift)
-    return BoardPose(
-        matrix, rms(camera.project(transform_points(matrix, view.points)) - view.pixels)
-    )
+    errors = camera.project(transform_points(matrix, view.points)) - view.pixels
+    return BoardPose(matrix, rms(errors))
 
 
 def on_a_line(points: Array) -> bool:

@@ -24,11 +24,11 @@ from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
 
 MINIMUM_MARKERS = 12
-PLANE_TOLERANCE = 0.005
+PLANE_TOLERANCE = 0.0025
 """Of the projector pixels that the markers span: what a lens bends and a table bows stays below,
 what lies on another surface above."""
-SECOND_SURFACE = 0.15
-"""Part of the markers that, on a plane of their own, make a second surface."""
+SECOND_SURFACE, SECOND_SURFACE_MARKERS = 0.15, 8
+"""Part, and number, of the markers that on a plane of their own make a second surface."""
 SAMPLES = 400
 INLIER_SIGMAS, INLIER_FLOOR_PX = 6.0, 1.0
 HUBER_PX = 1.0
@@ -111,6 +111,7 @@ def solve_projector(
     seen = _sightings(pictures, centres, camera)
     on_plane = _main_plane(seen)
     fit, used = _fit_inliers(seen, on_plane, lens)
+    _refuse_second_surface(seen, used)
     _refuse_mirrored(fit)
     held_out = np.empty_like(seen.pixels)
     for fold in np.unique(seen.fold):
@@ -205,38 +206,45 @@ def _blocks(pixels: Array) -> Array:
 
 
 def _main_plane(seen: _Sightings) -> Mask:
-    """Which markers (n,) lie on the plane that most of them share."""
-    span = float(np.linalg.norm(np.ptp(seen.pixels, axis=0)))
-    on_plane = _consensus(seen, PLANE_TOLERANCE * span)
-    rest = ~on_plane
+    """Which markers (n,) lie roughly on the plane that most of them share."""
+    on_plane = _consensus(seen)
     if on_plane.sum() < MINIMUM_MARKERS:
         raise SolveError(
             f"at most {on_plane.sum()} of {len(seen.ids)} projected markers lie on one plane, "
             f"{MINIMUM_MARKERS} are needed: clear the table and the beam"
         )
-    if rest.sum() >= max(8, SECOND_SURFACE * len(seen.ids)):
-        second = int(_consensus(seen[rest], PLANE_TOLERANCE * span).sum())
-        if second >= max(8, SECOND_SURFACE * len(seen.ids)):
-            raise SolveError(
-                f"the projected markers lie on several surfaces: {on_plane.sum()} on one plane, "
-                f"{second} on another; clear the table and the beam"
-            )
     return on_plane
 
 
-def _consensus(seen: _Sightings, tolerance: float) -> Mask:
-    """The largest set (n,) that one homography explains within `tolerance` pixels.
+def _refuse_second_surface(seen: _Sightings, used: Mask) -> None:
+    """SolveError when many of the markers that do not fit lie on a plane of their own."""
+    enough = max(SECOND_SURFACE_MARKERS, SECOND_SURFACE * len(seen.ids))
+    if np.count_nonzero(~used) < enough:
+        return
+    second = int(_consensus(seen[~used]).sum())
+    if second >= enough:
+        raise SolveError(
+            f"the projected markers lie on several surfaces: {used.sum()} on one plane, {second} "
+            "on another; clear the table and the beam"
+        )
 
-    Random samples of four, always the same ones: Fischler and Bolles, 1981.
+
+def _consensus(seen: _Sightings) -> Mask:
+    """The set (n,) that one homography explains best, within PLANE_TOLERANCE.
+
+    Random samples of four, always the same ones; what does not fit counts like the tolerance:
+    Torr and Zisserman, MLESAC, 2000.
     """
+    tolerance = PLANE_TOLERANCE * float(np.linalg.norm(np.ptp(seen.pixels, axis=0)))
     rng = np.random.default_rng(0)
     picks = np.array([rng.choice(len(seen.ids), 4, replace=False) for _ in range(SAMPLES)])
     with np.errstate(all="ignore"):
         maps = direct_linear_transform(seen.xy[picks], seen.pixels[picks])
         rows = np.einsum("sij,nj->sni", maps[..., :2], seen.xy) + maps[:, None, :, 2]
         off = np.linalg.norm(rows[..., :2] / rows[..., 2:] - seen.pixels, axis=-1)
-    inside = (off < tolerance) & np.isfinite(off)
-    return inside[np.argmax(inside.sum(axis=1))]
+    off = np.where(np.isfinite(off), off, np.inf)
+    best = np.argmin(np.square(np.minimum(off, tolerance)).sum(axis=1))
+    return off[best] < tolerance
 
 
 def _fit_inliers(seen: _Sightings, used: Mask, lens: LensPrior | None) -> tuple[ProjectorMap, Mask]:

@@ -20,6 +20,8 @@ from cellctl.geometry import Array
 State = TypeVar("State")
 
 LARGEST_DAMPING = 1e8
+NEGLIGIBLE = 1e-12
+"""A cost, in squared standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +124,7 @@ def minimise(
         new_cost = _cost(problem, candidate, huber)
         better = new_cost <= cost
         if better:
-            converged = cost - new_cost <= tolerance * cost
+            converged = cost - new_cost <= tolerance * cost + NEGLIGIBLE
             state, cost, damping = candidate, new_cost, max(damping / 10.0, 1e-12)
         else:
             damping *= 10.0
@@ -195,7 +197,8 @@ def _inverse(matrices: Array) -> Array:
     m = matrices.shape[-1]
     if m == 0:
         return matrices
-    diagonal = np.sqrt(np.maximum(np.diagonal(matrices, axis1=-2, axis2=-1), 1e-300))
+    diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
+    diagonal = np.sqrt(np.maximum(diagonal, 1e-30 * max(float(diagonal.max()), 1e-30)))
     outer = diagonal[..., :, None] * diagonal[..., None, :]
     values, vectors = np.linalg.eigh(matrices / outer)
     values = np.maximum(values, 1e-15)

@@ -105,5 +105,6 @@ def excess(errors: Sequence[Array], best: Sequence[Array]) -> float:
 
 
 def noise_px(errors: Array) -> float:
-    """Standard deviation of a coordinate, from the median length of errors (n, 2): Rayleigh's."""
-    return max(float(np.median(np.linalg.norm(errors, axis=-1))) / 1.1774, 1e-6)
+    """Standard deviation of a coordinate, from the median length of errors (n, 2): Rayleigh's.
+    Never below 0.001 px, so that perfect data remain solvable."""
+    return max(float(np.median(np.linalg.norm(errors, axis=-1))) / 1.1774, 1e-3)

@@ -137,7 +137,7 @@ def picture(
     image, to_px = texture(board)
     s = SUPERSAMPLE
     up = np.array([[s, 0, (s - 1) / 2], [0, s, (s - 1) / 2], [0, 0, 1.0]])
-    scaled = DARK + image.astype(np.float32) * ((BRIGHT - DARK) / 255.0)
+    scaled: Any = DARK + image.astype(np.float32) * ((BRIGHT - DARK) / 255.0)
     M = up @ H @ np.linalg.inv(to_px)
     # the texture is finer than the picture: soften it first, or the samples alias
     ratio = TEXTURE_PX_PER_M / (s * _scale(H, board))

@@ -1,0 +1,87 @@
+"""Real pictures and real robot poses, against the best figures known for them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cellctl.calib.camera import CameraModel
+from cellctl.geometry import rigid
+from cellctl.offline import solve_dataset
+
+
+@pytest.mark.parametrize(
+    ("name", "known_px", "views"),
+    [("opencv_left_intr", 0.191, 13), ("charuco_d435_intr", 0.672, 28)],
+)
+def test_intrinsic(shared_data, name, known_px, views):
+    result = solve_dataset(shared_data / name)
+    assert len(result["views"]["used"]) == views
+    assert result["rms_px"] <= result["held_out_px"] <= known_px
+    assert (result["verdict"], result["reasons"]) == ("pass", [])
+    CameraModel.from_dict(result["camera"])
+
+
+@pytest.mark.parametrize(
+    ("name", "known_px", "transforms"),
+    [
+        ("rct_charuco_e2h", 1.25 * 1.15, ("T_base_camera", "T_flange_board")),
+        ("ur_charuco_eih", 0.45, ("T_flange_camera", "T_base_board")),
+    ],
+)
+def test_hand_eye(shared_data, name, known_px, transforms):
+    result = solve_dataset(shared_data / name)
+    assert not result["views"]["rejected"]
+    assert result["held_out_px"] <= known_px
+    assert (result["verdict"], result["reasons"]) == ("pass", [])
+    closed = [c["held_out_px"] for n, c in result["candidates"].items() if n.startswith("closed")]
+    assert result["held_out_px"] < 0.7 * min(closed)
+    for transform in transforms:
+        rigid(result[transform], transform)
+    json.dumps(result)
+
+
+def copied(source: Path, folder: Path, change: Any) -> Path:
+    """The data set with its document changed; pictures are linked."""
+    document = json.loads((source / "dataset.json").read_text())
+    change(document)
+    (folder / "images").symlink_to(source / "images")
+    (folder / "dataset.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_shuffled_and_mislabelled(shared_data, tmp_path):
+    """Other order: the same to the last digit. Two pictures swapped: named, and not used."""
+    source = shared_data / "ur_charuco_eih"
+    for name in ("plain", "shuffled", "swapped"):
+        (tmp_path / name).mkdir()
+
+    def swap(document):
+        first, second = document["views"][1], document["views"][4]
+        first["image"], second["image"] = second["image"], first["image"]
+
+    plain = solve_dataset(copied(source, tmp_path / "plain", lambda document: None))
+    shuffled = solve_dataset(copied(source, tmp_path / "shuffled", lambda d: d["views"].reverse()))
+    assert json.dumps(plain) == json.dumps(shuffled)
+    swapped = solve_dataset(copied(source, tmp_path / "swapped", swap))
+    assert {"02", "05"} <= {r["id"] for r in swapped["views"]["rejected"]}
+    apart = np.array(swapped["T_flange_camera"]) - np.array(plain["T_flange_camera"])
+    assert np.linalg.norm(apart[:3, 3]) < 5e-3
+
+
+def test_intrinsic_pictures_come_along(shared_data, tmp_path):
+    """The camera from pictures of its own: here from the same ones, stated separately."""
+
+    def separate(document):
+        document["intrinsic_images"] = [
+            {"id": view["id"], "image": view["image"]} for view in document["views"]
+        ]
+        document["intrinsic_image_size"] = document["image_size"]
+
+    result = solve_dataset(copied(shared_data / "ur_charuco_eih", tmp_path, separate))
+    assert result["held_out_px"] < 0.6
+    assert not any("free camera" in name for name in result["candidates"])
