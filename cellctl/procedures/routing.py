@@ -61,6 +61,12 @@ class Roadmap:
         self._tried: list[set[int]] = [set() for _ in nodes]
         self._grow()
 
+    def add(self, nodes: Array) -> None:
+        """More postures (m, 6), numbered on from those that there are."""
+        self.nodes = np.vstack([self.nodes, nodes])
+        self._tried += [set() for _ in nodes]
+        self._grow()
+
     def path(self, start: Array, b: int) -> Path:
         """From the posture `start`, which stands at the tree's root, to tree node `b`."""
         goal = self.tree.nodes[b]

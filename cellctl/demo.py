@@ -1,0 +1,191 @@
+"""The whole product on a simulated cell: a daemon of its own, triggered over Zenoh, then scored.
+
+Only this module, besides the composition root, knows the simulation, and only it opens the
+truth's door: daemon, procedures and solvers see what a real cell would show them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cellctl.bus.client import Client
+from cellctl.bus.follow import Update
+from cellctl.bus.session import free_endpoint
+from cellctl.calib.calibration import Calibration
+from cellctl.config import load_config
+from cellctl.errors import BadInput, CellctlError, Unreachable
+from cellctl.messages import RunInfo
+from cellctl.sim.cell_config import cell_document, to_toml
+from cellctl.sim.endpoint import read_endpoint
+from cellctl.sim.launch import endpoint_file, stop_world
+from cellctl.sim.presets import PRESETS
+from cellctl.sim.scoring import Scorer
+
+READY_S = 60.0
+END_S = 30.0
+FOLDER = Path("demo-data")
+
+
+def run_demo(
+    cell: str,
+    seed: int,
+    *,
+    folder: Path | None = None,
+    follow: Callable[[Update], None] = lambda _: None,
+    procedure: str = "full",
+    params: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Calibrate the simulated cell `cell` of `seed`, unattended; the record stays in `folder`.
+
+    Returns what `cellctl demo --json` prints. Raises BadInput (unknown cell), Unreachable (the
+    daemon did not start or died) and what the run failed with.
+    """
+    if cell not in PRESETS:
+        raise BadInput(f"no simulated cell {cell!r}; there are: {', '.join(sorted(PRESETS))}")
+    started = time.monotonic()
+    folder = (folder or FOLDER / f"{cell}-{seed}-{datetime.now(UTC):%Y%m%dT%H%M%S}").absolute()
+    config = write_config(cell, seed, folder)
+    try:
+        with daemon(config, folder) as endpoint, Client(endpoint) as client:
+            info = _run(client, procedure, params or {}, follow)
+            result = asyncio.run(score(info, _calibration(client, info), folder))
+    finally:
+        stop_world(folder)
+    return {
+        "cell": cell,
+        "seed": seed,
+        **result,
+        "samples": info.samples,
+        "run": info.run_id,
+        "record": info.directory,
+        "wall_s": round(time.monotonic() - started, 1),
+    }
+
+
+def write_config(cell: str, seed: int, folder: Path) -> Path:
+    """The cell's TOML as an integrator would write it for this seed, on a free port."""
+    document = cell_document(PRESETS[cell], seed)
+    document["bus"] = {"listen": free_endpoint()}
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "cell.toml"
+    path.write_text(to_toml(document), encoding="utf-8")
+    return path
+
+
+def start_daemon(config: Path, folder: Path) -> subprocess.Popen[bytes]:
+    """A daemon process that serves `config` with its data in `folder`, ready to be asked.
+
+    Its log goes to `daemon.log` in `folder`. Unreachable when it does not get ready.
+    """
+    log = folder / "daemon.log"
+    with log.open("ab") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "cellctl", "serve", str(config)],
+            stdout=sink,
+            stderr=sink,
+            env={**os.environ, "CELLCTL_DATA": str(folder)},
+            start_new_session=True,
+        )
+    try:
+        _await_ready(process, load_config(config).bus.listen, log)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    return process
+
+
+@contextlib.contextmanager
+def daemon(config: Path, folder: Path) -> Iterator[str]:
+    """As `start_daemon`, stopped at the end of the block; gives its endpoint."""
+    process = start_daemon(config, folder)
+    try:
+        yield load_config(config).bus.listen
+    finally:
+        _end(process)
+
+
+def _await_ready(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> None:
+    deadline = time.monotonic() + READY_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            last = log.read_text(errors="replace").strip().splitlines()[-1:]
+            raise Unreachable(f"the daemon ended with code {process.returncode}: {''.join(last)}")
+        with contextlib.suppress(CellctlError), Client(endpoint) as client:
+            client.state()
+            return
+    raise Unreachable(f"the daemon was not ready within {READY_S:.0f} s; see {log}")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _run(
+    client: Client, procedure: str, params: dict[str, Any], follow: Callable[[Update], None]
+) -> RunInfo:
+    accepted = client.run(procedure, params, request_id=f"demo-{uuid.uuid4().hex[:16]}")
+    for update in client.watch(accepted.run_id):
+        follow(update)
+        if isinstance(update, RunInfo):
+            break
+    info = client.run_info(accepted.run_id)
+    if info.status == "done" and info.verdict == "pass" and info.calibration_id:
+        client.promote(info.calibration_id)
+    return info
+
+
+def _calibration(client: Client, info: RunInfo) -> Calibration | None:
+    """What came of the run, whatever its verdict."""
+    if info.calibration_id is None:
+        return None
+    document = client.calibration(info.calibration_id).document
+    return Calibration.from_dict(document["calibration"], info.calibration_id)
+
+
+async def score(info: RunInfo, calibration: Calibration | None, folder: Path) -> dict[str, Any]:
+    """The stage table and the final figures, scored against the truth of the world in `folder`."""
+    scorer = Scorer(read_endpoint(endpoint_file(folder)))
+    try:
+        grid = await scorer.grid()
+        rows = [
+            {
+                "name": stage["name"],
+                "training_px": stage["training_px"],
+                "held_out_px": stage["held_out_px"],
+                **await scorer.score(_staged(stage).project(grid)),
+            }
+            for stage in ((info.result or {}).get("data") or {}).get("stages", [])
+        ]
+        final: dict[str, Any] = {"true_px": None, "true_mm": None}
+        if calibration is not None:
+            final = dict(await scorer.score(calibration.project(grid)))
+        collisions = await scorer.collisions()
+    finally:
+        await scorer.close()
+    final |= {"verdict": info.verdict or info.status, "reasons": info.reasons or _why(info)}
+    return {"stages": rows, "final": final, "collisions": len(collisions)}
+
+
+def _staged(stage: dict[str, Any]) -> Calibration:
+    return Calibration.from_dict(stage["calibration"], stage["name"])
+
+
+def _why(info: RunInfo) -> list[str]:
+    return [info.error] if info.error else []

@@ -1,0 +1,359 @@
+"""Planning of views: which poses of a board, held before a camera, make a good sweep.
+
+Candidates are drawn in front of the camera, solved for the arm, and kept when the guard allows
+them, the whole board is in the picture and nothing of the arm hides it. From what is left a
+spread-out set is picked: extremes first, so that corners of the image and steep tilts come in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cellctl import ik
+from cellctl.arms import JOINTS
+from cellctl.calib.camera import CameraModel
+from cellctl.drivers.base import Path
+from cellctl.geometry import Array, Mask, invert, transform_points
+from cellctl.ik import random_starts
+from cellctl.motion import Guard
+from cellctl.procedures.routing import Roadmap, connect, nearest_first
+
+IK_STARTS = 12
+OCCLUSION_GRID = 5
+SEARCH_CANDIDATES = 250
+SEARCH_CHOICES = 24
+CONNECT_TRIES = 5
+HUBS_TRIED = 12
+BRIDGES = 2
+ENOUGH_CHOICE = 60
+CANDIDATES, CANDIDATES_PER_VIEW = 900, 40
+BATCHES = 3
+PARKING_CANDIDATES = 3000
+PARKING_TRIES = 60
+PARKING_BRIDGES = 4
+GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+SPIRAL_STEP = 0.07
+"""Radius of the search spiral's first point, in image widths."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """What planning assumes: the camera, where it hangs, and how the board is held.
+
+    `T_world_camera` and `T_flange_board` (4, 4) are estimates; `outline` (4, 2) are the corners
+    of the board's printed area in board metres.
+    """
+
+    camera: CameraModel
+    T_world_camera: Array
+    T_flange_board: Array
+    outline: Array
+
+    def flange(self, T_camera_board: Array) -> Array:
+        """T_world_flange (n, 4, 4) that shows the board at T_camera_board (n, 4, 4)."""
+        return self.T_world_camera @ T_camera_board @ invert(self.T_flange_board)
+
+    def board_points(self, T_camera_board: Array, grid: int = 2) -> Array:
+        """Points (n, grid^2, 3) of the board in the camera frame."""
+        low, high = self.outline.min(axis=0), self.outline.max(axis=0)
+        x, y = (np.linspace(a, b, grid) for a, b in zip(low, high, strict=True))
+        flat = np.stack([*np.meshgrid(x, y), np.zeros((grid, grid))], axis=-1).reshape(-1, 3)
+        turned = np.einsum("nij,mj->nmi", T_camera_board[:, :3, :3], flat)
+        return turned + T_camera_board[:, None, :3, 3]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What candidates look like. Tilts in degrees about an axis in the image plane; `fill` is
+    the share of the image's width that the board's longer side may take; `spin_deg` turns it in
+    its own plane."""
+
+    tilt_deg: tuple[float, float] = (20.0, 45.0)
+    spin_deg: float = 60.0
+    fill: tuple[float, float] = (0.22, 0.42)
+    middle: float = 1.0
+    edge_px: float = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedView:
+    """A planned view: how the camera will see the board, and the joints (6,) that show it."""
+
+    T_camera_board: Array
+    joints: Array
+
+
+def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:
+    """T_camera_board (count, 4, 4) before the camera, not yet checked against anything.
+
+    The board's middle is spread over the share `middle` of the image, more densely towards its
+    borders (arcsine distribution): distortion shows there. All quarter turns are tried, tilts are
+    about axes of every direction.
+    """
+    rng = np.random.default_rng(seed)
+    width, height = rig.camera.image_size
+    side = np.ptp(rig.outline, axis=0).max()
+    depth = rig.camera.K[0, 0] * side / (rng.uniform(*spread.fill, count) * width)
+    share = np.sin(np.pi * rng.uniform(-0.5, 0.5, (count, 2))) * spread.middle
+    middle = np.array([width, height]) * (0.5 + 0.5 * share)
+    rays = np.column_stack([rig.camera.normalise(middle), np.ones(count)])
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = _turns(spread, count, rng)
+    centre = np.array([*rig.outline.mean(axis=0), 0.0])
+    poses[:, :3, 3] = rays * depth[:, None] - poses[:, :3, :3] @ centre
+    return poses
+
+
+def _turns(spread: Spread, count: int, rng: np.random.Generator) -> Array:
+    tilt = np.radians(rng.uniform(*spread.tilt_deg, count))
+    about = rng.uniform(0.0, 2 * np.pi, count)
+    spin = np.radians(rng.uniform(-spread.spin_deg, spread.spin_deg, count))
+    spin += rng.integers(0, 4, count) * np.pi / 2
+    axis = np.column_stack([np.cos(about), np.sin(about), np.zeros(count)])
+    turned = Rotation.from_rotvec(axis * tilt[:, None]) * Rotation.from_euler("z", spin[:, None])
+    return turned.as_matrix()
+
+
+def visible(rig: Rig, T_camera_board: Array, edge_px: float) -> Mask:
+    """Whether the whole board (n,) lies in the picture, `edge_px` from its border, in front of
+    the camera and seen from its printed side at less than 60 degrees."""
+    points = rig.board_points(T_camera_board, 3)
+    in_front = (points[..., 2] > 0.05).all(axis=1)
+    safe = np.where(points[..., 2:] > 0.05, points, (0.0, 0.0, 1.0))
+    pixels = rig.camera.project(safe)
+    inside = (pixels > edge_px) & (pixels < np.array(rig.camera.image_size) - 1 - edge_px)
+    middle = points.mean(axis=1)
+    incidence = (T_camera_board[:, :3, 2] * middle).sum(axis=1) / np.linalg.norm(middle, axis=1)
+    return in_front & inside.all(axis=(1, 2)) & (incidence > 0.5)
+
+
+def unhidden(rig: Rig, guard: Guard, T_camera_board: Array, joints: Array) -> Mask:
+    """Whether no link of the arm and no pen stands between the camera and the board (n,)."""
+    bodies = [b for b in guard.bodies if b.name.startswith("link") or b.name == "pen"]
+    centres, radii = guard.spheres(joints, bodies)
+    centres = transform_points(invert(rig.T_world_camera), centres)
+    points = rig.board_points(T_camera_board, OCCLUSION_GRID)
+    return ~_blocked(points, centres, radii)
+
+
+def _blocked(points: Array, centres: Array, radii: Array) -> Mask:
+    """Whether any sphere (n, m) touches any segment from the origin to points (n, k, 3)."""
+    length2 = (points**2).sum(axis=-1)
+    along = np.einsum("nkj,nmj->nkm", points, centres) / length2[..., None]
+    nearest = points[:, :, None] * np.clip(along, 0.0, 1.0)[..., None]
+    distance = np.linalg.norm(nearest - centres[:, None], axis=-1)
+    return (distance < radii).any(axis=(1, 2))
+
+
+def feasible(
+    rig: Rig, guard: Guard, T_camera_board: Array, near: Array, edge_px: float
+) -> list[PlannedView]:
+    """The views that can be shown: in the picture, reachable, allowed by the guard, not hidden.
+
+    The same view may come several times, with different arm configurations; those nearest to the
+    posture `near` (6,) come first.
+    """
+    seen = T_camera_board[visible(rig, T_camera_board, edge_px)]
+    starts = np.vstack([near, ik.random_starts(guard.arm, IK_STARTS, seed=7)])
+    found = ik.solutions(guard.arm, rig.flange(seen), near, starts)
+    owner = np.repeat(np.arange(len(seen)), [len(joints) for joints in found])
+    if not len(owner):
+        return []
+    joints = np.concatenate(found)
+    good = guard.free(joints)
+    good[good] = unhidden(rig, guard, seen[owner[good]], joints[good])
+    return [PlannedView(seen[o], j) for o, j in zip(owner[good], joints[good], strict=True)]
+
+
+def spread_out(rig: Rig, views: list[PlannedView], count: int) -> list[PlannedView]:
+    """Up to `count` of `views`, far apart from each other, the most extreme first.
+
+    Farthest-point sampling over where the board is in the picture, how large, how tilted and how
+    spun it is (Gonzalez 1985); deterministic.
+    """
+    if len(views) <= count:
+        return list(views)
+    features = _features(rig, np.array([view.T_camera_board for view in views]))
+    chosen = [int(np.argmax(np.linalg.norm(features - features.mean(axis=0), axis=1)))]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return [views[i] for i in chosen]
+
+
+def _features(rig: Rig, poses: Array) -> Array:
+    """Dimensionless features (n, 7) in which one unit is about equally informative everywhere."""
+    points = rig.board_points(poses)
+    middle = rig.camera.project(points.mean(axis=1)) / np.array(rig.camera.image_size)
+    tilt = poses[:, :2, 2]
+    spin = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    return np.column_stack(
+        [
+            4.0 * middle,
+            1.5 * tilt,
+            0.3 * np.cos(spin),
+            0.3 * np.sin(spin),
+            np.log(points[..., 2].mean(axis=1)),
+        ]
+    )
+
+
+def search_views(
+    rig: Rig, guard: Guard, here: Array, step: int, had: Array, edge_px: float, seed: int
+) -> list[PlannedView]:
+    """Views worth trying next while the board's place is hardly known, best first.
+
+    Until the board was seen (`had` (n, 4, 4) is empty) the board is shown flat, on a spiral that
+    widens with `step` from the middle of the picture; afterwards tilted, and as different as
+    possible from the views `had`.
+    """
+    if not len(had):
+        flat = Spread(tilt_deg=(0.0, 20.0), spin_deg=180.0, fill=(0.16, 0.28), middle=0.9)
+        views = feasible(rig, guard, candidates(rig, flat, SEARCH_CANDIDATES, seed), here, edge_px)
+        return sorted(views, key=lambda view: _from_spiral(rig, view, step))
+    steep = min(15.0 + 5.0 * len(had), 35.0)
+    tilted = Spread(tilt_deg=(0.6 * steep, steep), fill=(0.18, 0.32), middle=0.5)
+    views = feasible(rig, guard, candidates(rig, tilted, SEARCH_CANDIDATES, seed), here, edge_px)
+    if not views:
+        return []
+    features = _features(rig, np.array([view.T_camera_board for view in views]))
+    gap = np.linalg.norm(features[:, None] - _features(rig, had), axis=2).min(axis=1)
+    return [views[i] for i in np.argsort(-gap, kind="stable")]
+
+
+def _from_spiral(rig: Rig, view: PlannedView, step: int) -> float:
+    """Distance of the board's middle from point `step` of a spiral (Vogel 1979), in widths."""
+    width, height = rig.camera.image_size
+    angle, radius = step * GOLDEN_ANGLE, SPIRAL_STEP * np.sqrt(step)
+    point = np.array([width / 2, height / 2]) + radius * width * np.array(
+        [np.cos(angle), np.sin(angle)]
+    )
+    middle = rig.camera.project(rig.board_points(view.T_camera_board[None]).mean(axis=1))[0]
+    return float(np.linalg.norm(middle - point) / width)
+
+
+def plan_sweep(
+    rig: Rig, guard: Guard, here: Array, spread: Spread, count: int, seed: int
+) -> list[PlannedView]:
+    """Up to `count` spread-out views in visiting order, then up to as many spares.
+
+    All can be reached from `here` (6,) over lines that the guard allows.
+    """
+    reached = _reachable_views(rig, guard, here, spread, count, seed)
+    chosen = spread_out(rig, reached, 2 * count)
+    main, spares = chosen[:count], chosen[count:]
+    if not main:
+        return []
+    order = nearest_first(here, np.array([view.joints for view in main]))
+    return [main[i] for i in order] + spares
+
+
+def _reachable_views(
+    rig: Rig, guard: Guard, here: Array, spread: Spread, count: int, seed: int
+) -> list[PlannedView]:
+    """A choice to pick `count` views from: candidates are drawn, and paths to them searched,
+    until it is large or drawing more is no use."""
+    views: list[PlannedView] = []
+    road = Roadmap(guard, here, np.empty((0, JOINTS)))
+    for batch in range(BATCHES):
+        drawn = candidates(rig, spread, CANDIDATES + CANDIDATES_PER_VIEW * count, seed + batch)
+        found = feasible(rig, guard, drawn, here, spread.edge_px)
+        views += found
+        road.add(np.array([view.joints for view in found]).reshape(-1, JOINTS))
+        bridged = BRIDGES
+        while len(_different(views, road)) < max(2 * count, ENOUGH_CHOICE) and bridged:
+            bridged = bridged - 1 if road.bridge() else 0
+        if len(_different(views, road)) >= max(2 * count, ENOUGH_CHOICE):
+            break
+    return _different(views, road)
+
+
+def _different(views: list[PlannedView], road: Roadmap) -> list[PlannedView]:
+    """The views that were reached, each with one of its arm configurations."""
+    first = {views[i].T_camera_board.tobytes(): i for i in sorted(road.index, reverse=True)}
+    return [views[i] for i in sorted(first.values())]
+
+
+def first_reached(
+    guard: Guard, here: Array, views: list[PlannedView], hubs: Array
+) -> tuple[PlannedView, Path] | None:
+    """The first of `views` that an allowed path leads to from `here`, and that path, if need be
+    over other views or over the postures `hubs` (n, 6)."""
+    joints = np.array([view.joints for view in views]).reshape(-1, JOINTS)
+    road = Roadmap(guard, here, np.vstack([joints, hubs]))
+    reached = [i for i in sorted(road.index) if i < len(views)]
+    if reached:
+        return views[reached[0]], road.path(here, road.index[reached[0]])
+    for view in views[:CONNECT_TRIES]:
+        path = connect(guard, here, view.joints)
+        if path is not None:
+            return view, path
+    return None
+
+
+def reach(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
+    """An allowed path from `here` to `goal` (6,), if need be over postures of `hubs` (n, 6).
+
+    Tried in this order: straight, over one hub, over several, by RRT-Connect.
+    """
+    direct = Path(goal[None])
+    if guard.allows(here, direct):
+        return direct
+    legs = np.abs(hubs - here).max(axis=1) + np.abs(hubs - goal).max(axis=1)
+    for hub in hubs[np.argsort(legs, kind="stable")[:HUBS_TRIED]]:
+        detour = Path(np.array([hub, goal]))
+        if guard.allows(here, detour):
+            return detour
+    road = Roadmap(guard, here, np.vstack([goal[None], hubs]))
+    if 0 in road.index:
+        return road.path(here, road.index[0])
+    return connect(guard, here, goal)
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """What must stay free for a device: the pyramid from `apex` (3,) over `base` (4, 3)."""
+
+    apex: Array
+    base: Array
+
+    def clearance(self, centres: Array, radii: Array) -> Array:
+        """How far the nearest of spheres (n, m, 3) is outside (n,), metres; negative: inside."""
+        edges = self.base - self.apex
+        normals = np.cross(edges, np.roll(edges, -1, axis=0))
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        if normals[0] @ (self.base.mean(axis=0) - self.apex) > 0:
+            normals = -normals
+        outside = (centres - self.apex) @ normals.T
+        return (outside.max(axis=2) - radii).min(axis=1)
+
+
+def parking(guard: Guard, beams: list[Beam], here: Array, margin: float, seed: int) -> Path | None:
+    """A path to a posture that leaves `margin` metres around all beams; the shortest of several.
+
+    Postures are drawn at random; where none keeps the margin, those that come nearest to it are
+    taken. None when no posture outside the beams can be reached.
+    """
+    drawn = np.vstack([here, random_starts(guard.arm, PARKING_CANDIDATES, seed)])
+    drawn = drawn[guard.free(drawn)]
+    centres, radii = guard.spheres(drawn)
+    clear = np.min([beam.clearance(centres, radii) for beam in beams], axis=0)
+    if len(drawn) == 0 or clear.max() <= 0.0:
+        return None
+    parked = drawn[clear >= min(margin, float(np.sort(clear)[-20:].min()))]
+    if np.array_equal(parked[0], here):
+        return Path(here[None])
+    near = np.argsort(np.abs(parked - here).max(axis=1), kind="stable")[:PARKING_TRIES]
+    hubs = drawn[np.argsort(np.abs(drawn - here).max(axis=1), kind="stable")[: 2 * PARKING_TRIES]]
+    road = Roadmap(guard, here, np.vstack([parked[near], hubs]))
+    for _ in range(PARKING_BRIDGES):
+        reached = [i for i in sorted(road.index) if i < len(near)]
+        if reached:
+            return road.path(here, road.index[reached[0]])
+        if not road.bridge():
+            return None
+    return None

@@ -1,0 +1,192 @@
+"""The projector: markers are shown on the free table and found by the camera.
+
+Several pictures, because 12 x 20 markers at once would be too small in the camera. In the end the
+first one is shown again: what moved in between spoils the result, and is noticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from cellctl.calib import patterns, projector
+from cellctl.calib.calibration import Calibration
+from cellctl.calib.camera import CameraModel
+from cellctl.calib.projector import LensPrior, ProjectorResult
+from cellctl.cell import Cell
+from cellctl.config import CellConfig
+from cellctl.errors import DeviceFault
+from cellctl.procedures.capture import darken, grab_still, mean_image
+from cellctl.procedures.knowledge import Knowledge, known, lens_prior, table_plane
+from cellctl.procedures.observations import picture
+from cellctl.procedures.parking import park
+from cellctl.procedures.record import Record, recorded
+from cellctl.run import Procedure, Result, Run
+from cellctl.store.history import Sample
+
+BEFORE, PICTURES, AGAIN = "before", "pictures", "again"
+FRAMES = 4
+DETECT_TIMEOUT_S = 30.0
+
+Markers = dict[int, Any]
+"""Centres {id: (2,)} in pixels."""
+
+
+class ProjectorParams(BaseModel):
+    """The grid of markers and in how many pictures it is shown."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    columns: int = Field(default=20, ge=4, le=50)
+    rows: int = Field(default=12, ge=3, le=50)
+    pictures: int = Field(default=4, ge=1, le=16)
+    max_held_out_px: float = Field(default=2.0, gt=0)
+    max_shift_px: float = Field(default=0.3, gt=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the camera found: markers in each picture, and where the projector put them."""
+
+    pictures: list[Markers]
+    centres: Markers
+    before: Markers
+    again: Markers
+
+
+def pictures_of(config: CellConfig, params: ProjectorParams) -> list[patterns.MarkerPicture]:
+    """What is shown."""
+    return patterns.marker_pictures(
+        config.projector.size_px, params.columns, params.rows, pictures=params.pictures
+    )
+
+
+async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
+    """Park the arm, show all pictures, and the first one again."""
+    shown = pictures_of(cell.config, params)
+    await park(run, cell, knowledge.T_world_camera, PICTURES)
+    await _take(run, cell, PICTURES, shown)
+    await _take(run, cell, AGAIN, shown[:1])
+    await darken(cell)
+
+
+async def look_before(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
+    """Show the first picture, for comparison at the end of a long run."""
+    await park(run, cell, knowledge.T_world_camera, BEFORE)
+    await _take(run, cell, BEFORE, pictures_of(cell.config, params)[:1])
+
+
+async def _take(run: Run, cell: Cell, step: str, shown: list[patterns.MarkerPicture]) -> None:
+    await run.step(step, len(shown))
+    for i, pattern in enumerate(shown):
+        key = f"picture-{i}"
+        if key in run.samples():
+            continue
+        await run.checkpoint(f"{key} is shown")
+        async with run.taking(key):
+            on_glass = await cell.projector.show(pattern.image)
+            image = mean_image(await grab_still(cell, on_glass, FRAMES))
+        found = await run.call(patterns.detect_markers, image, timeout_s=DETECT_TIMEOUT_S)
+        _refuse_another_picture(found, pattern.centres)
+        await run.sample(key, {"markers": markers_data(found)}, {"image": image})
+        run.progress(i + 1)
+
+
+def _refuse_another_picture(found: Markers, shown: Markers) -> None:
+    """DeviceFault when most markers that the camera sees are not in the picture shown."""
+    strange = found.keys() - shown.keys()
+    if 2 * len(strange) > len(found):
+        raise DeviceFault(
+            f"{len(strange)} of {len(found)} markers that the camera sees are not in the picture "
+            "shown: is projector.latency_s too short, or does another program use the projector?"
+        )
+
+
+def markers_data(found: Mapping[int, Any]) -> dict[str, list[float]]:
+    """The JSON form of found markers."""
+    return {str(number): [float(v) for v in centre] for number, centre in sorted(found.items())}
+
+
+def journalled(sample: Sample) -> Markers:
+    """The markers that were found when the sample was taken."""
+    return {int(n): np.array(centre) for n, centre in sample.data["markers"].items()}
+
+
+def seen(record: Record[ProjectorParams]) -> Shown:
+    """What was recorded; without a look before, the first picture is compared with the last."""
+    shown = pictures_of(record.config, record.params)
+    pictures = _found(record, PICTURES)
+    return Shown(
+        pictures=pictures,
+        centres={number: c for pattern in shown for number, c in pattern.centres.items()},
+        before=(_found(record, BEFORE) or pictures)[0],
+        again=_found(record, AGAIN)[0],
+    )
+
+
+def _found(record: Record[ProjectorParams], step: str) -> list[Markers]:
+    return [
+        patterns.detect_markers(picture(sample)) if record.again else journalled(sample)
+        for _, sample in sorted(record.samples(step).items())
+    ]
+
+
+def solve(shown: Shown, camera: CameraModel, lens: LensPrior) -> ProjectorResult:
+    """Pure: the map from the camera's to the projector's picture."""
+    return projector.solve_projector(shown.pictures, shown.centres, camera, lens=lens)
+
+
+def judge(
+    result: ProjectorResult, shown: Shown, params: ProjectorParams
+) -> tuple[str, tuple[str, ...]]:
+    """Pass or fail, with reasons; a shift between first and last look fails."""
+    limits = projector.ProjectorLimits(
+        held_out_px=params.max_held_out_px, shift_px=params.max_shift_px
+    )
+    shift = projector.shift_px(shown.before, shown.again)
+    return projector.judge(result, limits, shift=shift)
+
+
+def conclude(record: Record[ProjectorParams]) -> Result:
+    """Pure: from what was recorded to the result. A calibration comes of it when the hand-eye
+    was known already."""
+    shown, knowledge = seen(record), known(record.config, record.active)
+    result = solve(shown, knowledge.camera, lens_prior(record.config))
+    _, reasons = judge(result, shown, record.params)
+    data = {"kind": "projector", **result.to_dict()}
+    return Result.judged(reasons, data, _calibration(record.config, knowledge, result))
+
+
+def _calibration(
+    config: CellConfig, knowledge: Knowledge, result: ProjectorResult
+) -> dict[str, Any] | None:
+    """The active calibration with this projector; None when there was none."""
+    if not knowledge.calibrated:
+        return None
+    return Calibration(
+        camera=knowledge.camera,
+        T_world_camera=knowledge.T_world_camera,
+        table=table_plane(config),
+        projector=result.map,
+        boards=knowledge.boards,
+    ).to_dict()
+
+
+async def run_projector(run: Run, cell: Cell, params: ProjectorParams) -> Result:
+    """Collect, solve, judge."""
+    await collect(run, cell, params, known(cell.config, run.calibration))
+    return await run.call(conclude, recorded(run, cell.config, params))
+
+
+PROCEDURE = Procedure(
+    name="projector",
+    summary="Projector: shows markers on the free table and finds them with the camera",
+    params=ProjectorParams,
+    moves=True,
+    run=run_projector,
+    conclude=conclude,
+)

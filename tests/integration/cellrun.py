@@ -1,0 +1,100 @@
+"""A daemon on a simulated cell, as a person would start it, for tests that look from outside."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from cellctl.bus.client import Client
+from cellctl.config import load_config
+from cellctl.demo import start_daemon, write_config
+from cellctl.messages import RunInfo
+from cellctl.sim.launch import stop_world
+
+QUICK = {
+    "intrinsic": {"views": 8},
+    "hand_eye": {"views": 5},
+    "projector": {"columns": 10, "rows": 6, "pictures": 1},
+}
+"""Parameters of a `full` that is done soon; good enough to pass."""
+
+RUN_S = 240.0
+
+
+class CellRun:
+    """One data directory with its config; its daemon may die and be started again."""
+
+    def __init__(self, folder: Path, seed: int = 0, cell: str = "cr") -> None:
+        self.folder = folder
+        self.config = write_config(cell, seed, folder)
+        self.endpoint = load_config(self.config).bus.listen
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start the daemon and wait until it answers."""
+        self._process = start_daemon(self.config, self.folder)
+
+    def kill(self) -> None:
+        """SIGKILL, as the power switch would do it."""
+        self._signal(signal.SIGKILL)
+
+    def terminate(self) -> int:
+        """SIGTERM; the exit code."""
+        return self._signal(signal.SIGTERM)
+
+    def _signal(self, number: int) -> int:
+        assert self._process is not None
+        process, self._process = self._process, None
+        process.send_signal(number)
+        return process.wait(30)
+
+    def log(self) -> str:
+        return (self.folder / "daemon.log").read_text(errors="replace")[-4000:]
+
+    def client(self) -> Client:
+        return Client(self.endpoint)
+
+    def finish(self, run_id: str) -> RunInfo:
+        """Wait for the end of a run."""
+        deadline = time.monotonic() + RUN_S
+        with self.client() as client:
+            while time.monotonic() < deadline:
+                info = client.run_info(run_id)
+                if info.status not in ("running", "waiting"):
+                    return info
+                time.sleep(0.1)
+        raise AssertionError(f"run {run_id} did not end:\n{self.log()}")
+
+    def journal(self, run_id: str) -> list[str]:
+        """The complete lines of a run's journal."""
+        path = self.folder / "runs" / run_id / "journal.jsonl"
+        if not path.exists():
+            return []
+        return [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+    def result(self, run_id: str) -> dict[str, Any]:
+        """What result.json says, without what names the run."""
+        document = json.loads((self.folder / "runs" / run_id / "result.json").read_text())
+        return {key: document[key] for key in ("verdict", "reasons", "data")}
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._signal(signal.SIGKILL)
+        stop_world(self.folder)
+
+
+@contextlib.contextmanager
+def cell_run(folder: Path, seed: int = 0) -> Iterator[CellRun]:
+    """A CellRun with a running daemon; nothing of it is left afterwards."""
+    run = CellRun(folder, seed)
+    try:
+        run.start()
+        yield run
+    finally:
+        run.close()

@@ -1,0 +1,80 @@
+"""The whole product on the simulated cell, from outside: daemon, bus, world, record."""
+
+from __future__ import annotations
+
+import json
+import random
+
+import pytest
+
+from cellctl.calib.calibration import Calibration
+from cellctl.offline import solve_folder
+from cellctl.sim.scoring import Scorer
+from tests.integration.cellrun import QUICK, cell_run
+from tests.soak.kill import killed
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A quick `full` that ran undisturbed, and its cell, still alive."""
+    folder = tmp_path_factory.mktemp("cell")
+    with cell_run(folder) as cell:
+        with cell.client() as client:
+            run_id = client.run("full", QUICK).run_id
+        yield cell, cell.finish(run_id)
+
+
+def test_it_calibrates_alone(done):
+    cell, info = done
+    assert info.status == "done", cell.log()
+    assert info.verdict == "pass", info.reasons
+    with cell.client() as client:
+        document = client.calibration(info.calibration_id).document
+    calibration = Calibration.from_dict(document["calibration"])
+    scorer = Scorer(cell.folder)
+    assert scorer.score(calibration.project(scorer.grid()))["true_mm"] < 3.0
+    assert scorer.collisions() == 0
+
+
+def test_solved_again_offline_it_is_the_online_result(done):
+    cell, info = done
+    again = solve_folder(cell.folder / "runs" / info.run_id)
+    online = cell.result(info.run_id)
+    assert again["verdict"] == online["verdict"]
+    assert {key: again[key] for key in online["data"]} == online["data"]
+
+
+def test_pictures_and_poses_are_on_disk(done):
+    cell, info = done
+    folder = cell.folder / "runs" / info.run_id
+    samples = [json.loads(line) for line in cell.journal(info.run_id)]
+    named = [
+        image["file"]
+        for line in samples
+        if line["kind"] == "sample"
+        for image in line["data"]["images"].values()
+    ]
+    assert len(named) >= info.samples
+    assert all((folder / name).is_file() for name in named)
+
+
+def test_killed_and_resumed_it_ends_with_the_same_result(done, tmp_path):
+    cell, info = done
+    with cell_run(tmp_path) as other:
+        run_id, wrong = killed(other, kills=2, span_s=8.0, chance=random.Random(5))
+        assert not wrong
+        assert other.finish(run_id).status == "done", other.log()
+        assert other.result(run_id) == cell.result(info.run_id)
+
+
+def test_sigterm_interrupts_the_run_and_ends_cleanly(tmp_path):
+    with cell_run(tmp_path) as cell:
+        with cell.client() as client:
+            run_id = client.run("projector").run_id
+        assert cell.terminate() == 0, cell.log()
+        cell.start()
+        with cell.client() as client:
+            assert client.run_info(run_id).status == "interrupted"
+            assert client.state().phase == "idle"
+            client.resume(run_id)
+        assert cell.finish(run_id).status == "done"
