@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from cellctl.arms import arm
-from cellctl.errors import BadInput, CellctlError
+from cellctl.calib.targets import board_from_dict
+from cellctl.errors import BadInput
 from cellctl.geometry import Transform
 
 Vector = tuple[float, float, float]
@@ -24,6 +26,14 @@ Positive = Annotated[float, Field(gt=0)]
 Pixels = tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
+
+
+def _explained(check: Callable[..., object], *args: Any) -> None:
+    """Run a check that raises BadInput where pydantic wants a ValueError, which it then places."""
+    try:
+        check(*args)
+    except BadInput as error:
+        raise ValueError(error.message) from None
 
 
 class Section(BaseModel):
@@ -80,7 +90,8 @@ class RobotSection(Section):
     @field_validator("arm")
     @classmethod
     def _known_arm(cls, value: str) -> str:
-        return arm(value).name
+        _explained(arm, value)
+        return value
 
 
 class FactoryCamera(Section):
@@ -140,6 +151,12 @@ class BoardMount(Section):
     board: dict[str, Any]
     pose: Pose
     hull: Box
+
+    @field_validator("board")
+    @classmethod
+    def _known_board(cls, value: dict[str, Any]) -> dict[str, Any]:
+        _explained(board_from_dict, value, "board")
+        return value
 
 
 class PenMount(Section):
@@ -221,8 +238,6 @@ def parse_config(document: dict[str, Any], where: str) -> CellConfig:
     except ValidationError as error:
         lines = [_explain(item) for item in error.errors(include_url=False)]
         raise BadInput(f"{where}: " + "; ".join(lines)) from None
-    except CellctlError as error:
-        raise BadInput(f"{where}: {error.message}") from None
 
 
 def _explain(item: Any) -> str:
@@ -231,7 +246,8 @@ def _explain(item: Any) -> str:
         return f"unknown key {key!r}{_nearest(item['loc'])}"
     if item["type"] == "missing":
         return f"missing key {key!r}"
-    return f"{key}: {item['msg']}" if key else str(item["msg"])
+    message = str(item["msg"]).removeprefix("Value error, ")
+    return f"{key}: {message}" if key else message
 
 
 def _nearest(location: tuple[Any, ...]) -> str:

@@ -34,6 +34,7 @@ class CellRun:
         self.folder = folder
         self.config = write_config(cell, seed, folder)
         self.endpoint = load_config(self.config).bus.listen
+        self.kills = 0
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -43,6 +44,7 @@ class CellRun:
     def kill(self) -> None:
         """SIGKILL, as the power switch would do it."""
         self._signal(signal.SIGKILL)
+        self.kills += 1
 
     def terminate(self) -> int:
         """SIGTERM; the exit code."""

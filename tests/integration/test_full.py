@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import random
 
 import pytest
 
 from cellctl.calib.calibration import Calibration
+from cellctl.demo import score
 from cellctl.offline import solve_folder
-from cellctl.sim.scoring import Scorer
 from tests.integration.cellrun import QUICK, cell_run
 from tests.soak.kill import killed
 
@@ -31,9 +32,9 @@ def test_it_calibrates_alone(done):
     with cell.client() as client:
         document = client.calibration(info.calibration_id).document
     calibration = Calibration.from_dict(document["calibration"])
-    scorer = Scorer(cell.folder)
-    assert scorer.score(calibration.project(scorer.grid()))["true_mm"] < 3.0
-    assert scorer.collisions() == 0
+    scored = asyncio.run(score(info, calibration, cell.folder))
+    assert scored["final"]["true_mm"] < 3.0
+    assert scored["collisions"] == 0
 
 
 def test_solved_again_offline_it_is_the_online_result(done):

@@ -40,6 +40,8 @@ def test_a_way_round_is_found_and_is_allowed(guard, sides):
 
 def test_the_same_way_every_time(guard, sides):
     one, two = (routing.connect(guard, *sides) for _ in range(2))
+    assert one is not None
+    assert two is not None
     assert np.array_equal(one.waypoints, two.waypoints)
 
 

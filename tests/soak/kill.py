@@ -76,12 +76,12 @@ def soak(kills: int, per_run: int, seed: int, folder: Path) -> list[str]:
         with cell_run(folder / f"killed-{done:03}") as cell:
             run_id, failures = killed(cell, count, span_s / per_run, chance)
             wrong += failures
+            done += cell.kills
             info = cell.finish(run_id)
             if info.status != "done":
                 wrong.append(f"{run_id}: ended {info.status}: {info.error}")
             elif cell.result(run_id) != expected:
                 wrong.append(f"{run_id}: another result than the uninterrupted run")
-        done += count
         print(f"{done} of {kills} kills, {len(wrong)} failures", flush=True)
     return wrong
 
