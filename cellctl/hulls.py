@@ -27,6 +27,12 @@ class Body:
         pose = frames[..., self.frame, :, :]
         return self.points @ np.swapaxes(pose[..., :3, :3], -1, -2) + pose[..., None, :3, 3]
 
+    def wrapped(self) -> Body:
+        """One sphere around all of them."""
+        middle = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        radius = (np.linalg.norm(self.points - middle, axis=1) + self.radii).max()
+        return Body(self.name, self.frame, middle[None], np.array([radius]))
+
 
 def capsule_body(name: str, capsule: Capsule) -> Body:
     """Spheres that cover a capsule: neighbours one radius apart, radius enlarged by 12 %."""

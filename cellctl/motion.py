@@ -63,8 +63,13 @@ class Violation:
     reason: str
 
 
-Checks = list[tuple[str, Mask]]
-"""Rules in words, and which of the checked states (n,) each of them refuses."""
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """What each of `who` must not do, and in which of the checked states it does: (n, len(who))."""
+
+    what: str
+    who: tuple[str, ...]
+    broken: Mask
 
 
 class Guard:
@@ -80,21 +85,36 @@ class Guard:
     ) -> None:
         self.arm, self.bodies, self.scene = model, bodies, scene
         self.clearance, self.joint_margin = clearance_m, joint_margin_rad
-        self._free_bodies = [body for body in bodies if body.frame >= FIRST_FREE_FRAME]
+        free = [body for body in bodies if body.frame >= FIRST_FREE_FRAME]
+        self._free_bodies = free
+        self._who = tuple(body.name for body in free for _ in body.radii)
+        self._reach = np.concatenate(
+            [body.radii + clearance_m * (body.frame > FIRST_FREE_FRAME) for body in free]
+        )
+        self._wraps = [body.wrapped() for body in bodies]
         self._pairs = _pairs(bodies)
 
     def free(self, joints: Array) -> Mask:
         """Whether each of joints (n, 6) is allowed."""
-        return np.logical_and.reduce([~hit for _, hit in self._checks(joints)])
+        return ~np.logical_or.reduce([rule.broken.any(axis=1) for rule in self.rules(joints)])
 
     def first_violation(self, joints: Array) -> Violation | None:
         """The first of joints (n, 6) that is refused."""
         first: Violation | None = None
-        for reason, hit in self._checks(joints):
-            index = int(np.argmax(hit))
-            if hit[index] and (first is None or index < first.index):
-                first = Violation(index, reason)
+        for rule in self.rules(joints):
+            index = int(np.argmax(rule.broken.any(axis=1)))
+            broken = rule.broken[index]
+            if broken.any() and (first is None or index < first.index):
+                first = Violation(index, f"{rule.who[int(np.argmax(broken))]} {rule.what}")
         return first
+
+    def rules(self, joints: Array) -> list[Rule]:
+        """All rules, looked at in joints (n, 6)."""
+        joints = np.atleast_2d(joints)
+        frames = self.arm.link_frames(joints)
+        outside = ~self.arm.within_limits(joints, self.joint_margin)
+        limit = Rule("is at its limit", ("a joint",), outside[:, None])
+        return [limit, *self._surroundings(frames), self._self_collision(frames)]
 
     def check(self, start: Array, path: Path) -> None:
         """MotionRefused unless the whole path from the joints `start` (6,) is allowed."""
@@ -155,39 +175,36 @@ class Guard:
         centres, _ = self.spheres(joints)
         return float(PIECES * np.linalg.norm(np.diff(centres, axis=0), axis=2).max())
 
-    def _checks(self, joints: Array) -> Checks:
-        """(reason, hit (n,)) of every rule for joints (n, 6)."""
-        joints = np.atleast_2d(joints)
-        frames = self.arm.link_frames(joints)
-        inside = self.arm.within_limits(joints, self.joint_margin)
-        checks: Checks = [("a joint is at its limit", ~inside)]
-        centres = [body.world(frames) for body in self.bodies]
-        for body, spheres in zip(self.bodies, centres, strict=True):
-            if body.frame >= FIRST_FREE_FRAME:
-                checks += self._surroundings(body, spheres)
-        for i, j in self._pairs:
-            one, other = self.bodies[i], self.bodies[j]
-            meet = _meet(centres[i], one.radii, centres[j], other.radii)
-            checks.append((f"{one.name} and {other.name} meet", meet))
-        return checks
-
-    def _surroundings(self, body: Body, centres: Array) -> Checks:
-        scene = self.scene
-        reach = body.radii + (self.clearance if body.frame > FIRST_FREE_FRAME else 0.0)
+    def _surroundings(self, frames: Array) -> list[Rule]:
+        scene, reach = self.scene, self._reach
+        centres = np.concatenate([body.world(frames) for body in self._free_bodies], axis=1)
         room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
         height = centres[..., 2] - scene.table_height
-        checks: Checks = [
-            (f"{body.name} leaves the workspace box", (room - reach).min(axis=1) < 0.0),
-            (f"{body.name} comes too near to the table", (height - reach).min(axis=1) < 0.0),
+        rules = [
+            Rule("leaves the workspace box", self._who, room < reach),
+            Rule("comes too near to the table", self._who, height < reach),
         ]
         for keepout in scene.keepouts:
             away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
-            hit = (np.linalg.norm(away, axis=-1) - reach).min(axis=1) < 0.0
-            checks.append((f"{body.name} enters keep-out {keepout.name!r}", hit))
+            inside = (away**2).sum(axis=-1) < reach**2
+            rules.append(Rule(f"enters keep-out {keepout.name!r}", self._who, inside))
         for name, centre, radius in scene.balls:
-            near = np.linalg.norm(centres - centre, axis=-1) - reach - radius
-            checks.append((f"{body.name} comes too near to the {name}", near.min(axis=1) < 0.0))
-        return checks
+            near = ((centres - centre) ** 2).sum(axis=-1) < (reach + radius) ** 2
+            rules.append(Rule(f"comes too near to the {name}", self._who, near))
+        return rules
+
+    def _self_collision(self, frames: Array) -> Rule:
+        """Which pairs of bodies meet: looked at sphere by sphere where the balls around them do."""
+        wraps = np.concatenate([wrap.world(frames) for wrap in self._wraps], axis=1)
+        radii = np.concatenate([wrap.radii for wrap in self._wraps])
+        i, j = np.array(self._pairs).T
+        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
+        for k in np.flatnonzero(near.any(axis=0)):
+            one, other = self.bodies[i[k]], self.bodies[j[k]]
+            some = frames[near[:, k]]
+            near[near[:, k], k] = _meet(one.world(some), one.radii, other.world(some), other.radii)
+        who = tuple(f"{self.bodies[a].name} and {self.bodies[b].name}" for a, b in self._pairs)
+        return Rule("meet", who, near)
 
 
 def _pairs(bodies: tuple[Body, ...]) -> list[tuple[int, int]]:

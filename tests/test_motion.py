@@ -78,7 +78,12 @@ def test_joint_limits_have_a_margin(guard, start):
 
 def test_self_collision_is_refused(guard):
     wings_into_forearm = np.radians([[-131.0, -17.0, 24.0, 55.0, -143.0, -89.0]])
-    reasons = [reason for reason, hit in guard._checks(wings_into_forearm) if hit[0]]
+    reasons = [
+        f"{who} {rule.what}"
+        for rule in guard.rules(wings_into_forearm)
+        for who, broken in zip(rule.who, rule.broken[0], strict=True)
+        if broken
+    ]
     assert "link 3 and marker board meet" in reasons
 
 

@@ -33,6 +33,9 @@ from cellctl.geometry import Array, Mask, invert
 PINHOLE = (0, 1, 2, 3)
 FULL = tuple(range(9))
 """Free intrinsic parameters: places in camera.INTRINSICS."""
+SCALE_SIGMA, WARP_SIGMA = 0.005, 0.01
+"""How far prints are off before the data have been asked: scale, and lift at the edge of the
+board in half lengths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,12 @@ class PosePrior:
 
     mean: Array
     sigma: Array
+
+    def whitened(self, pose: Array) -> tuple[Array, Array]:
+        """Residuals (6,) of a pose, and their derivatives (6, 6) by T @ pose(d)."""
+        off = (invert(self.mean) @ pose)[None]
+        slopes = pose_vector_derivatives(off)[0] / self.sigma[:, None]
+        return pose_vectors(off)[0] / self.sigma, slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +182,7 @@ class Chain:
         return derivatives_by_pose(by_point @ outer, moved)
 
     def priors(self, state: ChainState) -> Priors:
-        on_globals, globals_jacobian = self._priors_on_poses(state)
+        on_globals, globals_jacobian = self._priors_on_globals(state)
         n = len(state.corrections)
         if self.sigma_robot is None or not self.free.corrections:
             size = 6 * self.free.corrections
@@ -185,18 +194,31 @@ class Chain:
             pose_vector_derivatives(state.corrections) / self.sigma_robot[:, None],
         )
 
-    def _priors_on_poses(self, state: ChainState) -> tuple[Array, Array]:
-        residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.free.count))]
-        known = ((self.camera_prior, state.camera_pose), (self.board_prior, state.board_pose))
-        for place, (prior, pose) in enumerate(known):
-            if prior is None:
-                continue
-            off = (invert(prior.mean) @ pose)[None]
-            start = len(self.free.intrinsics) + 6 * place
-            block = np.zeros((6, self.free.count))
-            block[:, start : start + 6] = pose_vector_derivatives(off)[0] / prior.sigma[:, None]
-            residuals.append(pose_vectors(off)[0] / prior.sigma)
+    def _priors_on_globals(self, state: ChainState) -> tuple[Array, Array]:
+        """What is known of poses (if told), and of what a printer does to a board (always)."""
+        place, count = len(self.free.intrinsics), self.free.count
+        residuals, jacobians = [np.zeros(0)], [np.zeros((0, count))]
+
+        def add(residual: Array, jacobian: Array) -> None:
+            block = np.zeros((len(residual), count))
+            block[:, place : place + jacobian.shape[1]] = jacobian
+            residuals.append(residual)
             jacobians.append(block)
+
+        if self.free.poses:
+            for prior, pose in (
+                (self.camera_prior, state.camera_pose),
+                (self.board_prior, state.board_pose),
+            ):
+                if prior is not None:
+                    add(*prior.whitened(pose))
+                place += 6
+        if self.free.scale:
+            add(np.array([state.log_scale / SCALE_SIGMA]), np.array([[1.0 / SCALE_SIGMA]]))
+            place += 1
+        if self.free.warp:
+            sigma = WARP_SIGMA * float(self.sheet.half.max())
+            add(state.warp / sigma, np.eye(3) / sigma)
         return np.concatenate(residuals), np.concatenate(jacobians)
 
     def retract(self, state: ChainState, by_globals: Array, by_locals: Array) -> ChainState:

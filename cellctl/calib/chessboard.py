@@ -7,6 +7,8 @@ tell the ends apart unless both counts are odd or both even.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -27,9 +29,9 @@ from cellctl.geometry import Array
 LONGEST_PX = 960
 SADDLE_SIGMA, SADDLE_STRENGTH = 1.5, 4.0
 """A crossing of 30 grey levels of contrast, blurred by a pixel, is that strong."""
-ALTERNATING = 0.9
+ALTERNATING = 0.8
 """Part of the squares that must be darker or brighter than their neighbours, as they should."""
-STRAY = 0.25
+STRAY = 0.4
 """How far corners may be from a plane's picture, in distances between neighbours."""
 MOVED_PX, MOVED = 2.5, 0.05
 """How far refinement may move a corner: pixels of the reduced picture, and of the spacing."""
@@ -37,19 +39,37 @@ MOVED_PX, MOVED = 2.5, 0.05
 
 def find_chessboard(image: Grey, inner_corners: tuple[int, int]) -> Array | None:
     """Corners (n, 2) in pixels, row by row, or None when the whole board is not in sight."""
+    for finder in (_quick, _thorough):
+        rough = finder(image, inner_corners)
+        if rough is None:
+            continue
+        grid = _oriented(image, rough)
+        pixels = None if grid is None else _refined(image, grid)
+        if pixels is not None:
+            return pixels
+    return None
+
+
+def _quick(image: Grey, inner_corners: tuple[int, int]) -> Array | None:
+    """Corners (rows, columns, 2) by OpenCV's classic finder: some milliseconds, sharp boards."""
     small, scale = reduced(image, LONGEST_PX, 0.7)
     found, corners = cv2.findChessboardCorners(small, inner_corners, flags=0)
-    if not found:
-        small, scale = reduced(image, LONGEST_PX, 0.0)
-        if not _plausible(small, inner_corners):
-            return None
-        found, corners = cv2.findChessboardCornersSB(small, inner_corners)
-    if not found or corners is None:
+    return _grid(corners, inner_corners, scale) if found else None
+
+
+def _thorough(image: Grey, inner_corners: tuple[int, int]) -> Array | None:
+    """Corners (rows, columns, 2) by the sector-based finder (Duda and Frese, 2018), which takes
+    its time, if there are crossings enough in sight."""
+    small, scale = reduced(image, LONGEST_PX, 0.0)
+    if not _plausible(small, inner_corners):
         return None
+    found, corners = cv2.findChessboardCornersSB(small, inner_corners)
+    return _grid(corners, inner_corners, scale) if found else None
+
+
+def _grid(corners: Any, inner_corners: tuple[int, int], scale: float) -> Array:
     columns, rows = inner_corners
-    rough = enlarged(np.asarray(corners, dtype=float).reshape(rows, columns, 2), scale)
-    grid = _oriented(image, rough)
-    return None if grid is None else _refined(image, grid, MOVED_PX / scale)
+    return enlarged(np.asarray(corners, dtype=float).reshape(rows, columns, 2), scale)
 
 
 def _plausible(image: Grey, inner_corners: tuple[int, int]) -> bool:
@@ -103,8 +123,10 @@ def _flat(grid: Array) -> bool:
     return bool(off.max() < STRAY * max(grid_spacing(grid), 1.0) + 1.0)
 
 
-def _refined(image: Grey, grid: Array, limit_px: float) -> Array | None:
-    rough, spacing = grid.reshape(-1, 2), grid_spacing(grid)
+def _refined(image: Grey, grid: Array) -> Array | None:
+    """Sub-pixel corners (n, 2), or None when one moves further than a finder can be wrong."""
+    rough = grid.reshape(-1, 2)
     pixels = refine_crossings(image, rough, grid_axes(grid))
+    limit = MOVED_PX * max(1.0, max(image.shape) / LONGEST_PX) + MOVED * grid_spacing(grid)
     moved = np.linalg.norm(pixels - rough, axis=1)
-    return pixels if moved.max() < limit_px + MOVED * spacing else None
+    return pixels if moved.max() < limit else None

@@ -22,10 +22,10 @@ from cellctl.errors import SolveError
 from cellctl.geometry import Array, invert
 
 HAND_EYE = {
-    "tsai": cv2.CALIB_HAND_EYE_TSAI,
     "park": cv2.CALIB_HAND_EYE_PARK,
     "horaud": cv2.CALIB_HAND_EYE_HORAUD,
     "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
+    "tsai": cv2.CALIB_HAND_EYE_TSAI,
 }
 METHODS = (*HAND_EYE, "shah")
 SUBSETS, SUBSET_SIZE = 60, 4

@@ -285,7 +285,7 @@ def _spread(data: RobotData, state: ChainState) -> tuple[Array, Array]:
 
 def _covariance(job: Job, chosen: Candidate) -> Array:
     """(12, 12) of both poses with the robot's noise as estimated, whatever was chosen."""
-    option = replace(chosen.option, method="", exact_robot=False)
+    option = replace(chosen.option, method="", exact_robot=False, correlated=False)
     start = replace(chosen.state, corrections=job.data.no_corrections)
     first = len(option.free.intrinsics)
     covariance = adjust(option, replace(job, start=start)).globals_covariance

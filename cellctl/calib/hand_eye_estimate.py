@@ -53,10 +53,14 @@ class HandEyeEstimate:
         return np.linalg.norm(np.sqrt(self.covariance.diagonal()).reshape(4, 3), axis=1)
 
 
-def tape(pose: Transform, position_m: float = 0.1, angle_deg: float = 10.0) -> PosePrior:
-    """A pose as a tape measure gives it, with one standard deviation per axis."""
-    sigma = np.repeat([np.radians(angle_deg), position_m], 3)
-    return PosePrior(pose.matrix, sigma)
+TAPE = (0.1, float(np.radians(10.0)))
+"""One standard deviation per axis of a tape-measured pose: metres and radians."""
+
+
+def prior(pose: Transform, sigma: tuple[float, float]) -> PosePrior:
+    """A pose known beforehand, with one standard deviation per axis in metres and in radians."""
+    metres, radians = sigma
+    return PosePrior(pose.matrix, np.repeat([radians, metres], 3))
 
 
 def estimate(
@@ -66,17 +70,15 @@ def estimate(
     board_pose: Transform,
     *,
     mount: Mount = "eye-to-hand",
-    position_m: float = 0.1,
-    angle_deg: float = 10.0,
+    camera_sigma: tuple[float, float] = TAPE,
+    board_sigma: tuple[float, float] = TAPE,
 ) -> HandEyeEstimate:
-    """The poses of camera and board that views and tape measure make most likely.
+    """The poses of camera and board that views and earlier knowledge make most likely.
 
-    Both poses come tape-measured, within `position_m` and `angle_deg` per axis. Works from one
-    view on. SolveError when no view shows a pose of the board.
+    Each pose comes with one standard deviation per axis, metres and radians. Works from one view
+    on. SolveError when no view shows a pose of the board.
     """
-    priors = PosePriors(
-        tape(camera_pose, position_m, angle_deg), tape(board_pose, position_m, angle_deg)
-    )
+    priors = PosePriors(prior(camera_pose, camera_sigma), prior(board_pose, board_sigma))
     found, lost = possible_poses(ordered(views), camera)
     if not found:
         raise SolveError("; ".join(r.reason for r in lost) or "no view of the board to start from")

@@ -152,7 +152,11 @@ def _poses(view: RobotView, turn: Array, camera: CameraModel) -> Possible:
 
 @dataclass(frozen=True)
 class Option:
-    """One way to solve: a closed form by `method`, or the adjustment with these unknowns."""
+    """One way to solve: a closed form by `method`, or the adjustment with these unknowns.
+
+    `correlated` errors of a view's corners, as lens and board leave them, count like one corner;
+    independent ones, as noise makes them, each for itself.
+    """
 
     name: str
     method: str = ""
@@ -160,6 +164,7 @@ class Option:
     scale: bool = False
     warp: bool = False
     exact_robot: bool = False
+    correlated: bool = False
 
     @property
     def free(self) -> Free:
@@ -189,7 +194,7 @@ def _adjustment(*, camera: bool, scale: bool, warp: bool, exact: bool) -> Option
     free = [word for word, on in (("camera", camera), ("scale", scale), ("warp", warp)) if on]
     robot = "exact robot" if exact else "noisy robot"
     name = f"adjustment, {robot}" + (f", free {', '.join(free)}" if free else "")
-    return Option(name, "", camera, scale, warp, exact)
+    return Option(name, "", camera, scale, warp, exact, correlated=True)
 
 
 def fit(option: Option, job: Job, tolerance: float = 1e-10) -> ChainState:
@@ -202,15 +207,16 @@ def fit(option: Option, job: Job, tolerance: float = 1e-10) -> ChainState:
 
 def adjust(option: Option, job: Job, tolerance: float = 1e-10) -> Solution[ChainState]:
     """The adjustment of an option, from the job's start."""
+    inflation = np.sqrt(job.data.batch.seen.sum(axis=1).mean()) if option.correlated else 1.0
     chain = replace(
-        job.data.chain(option.free, job.noise.px, job.noise.robot),
+        job.data.chain(option.free, job.noise.px * inflation, job.noise.robot),
         camera_prior=job.priors.camera,
         board_prior=job.priors.board,
     )
     start = job.start
     if option.exact_robot:
         start = replace(start, corrections=job.data.no_corrections)
-    return minimise(chain, start, huber=HUBER, tolerance=tolerance)
+    return minimise(chain, start, huber=HUBER / inflation, tolerance=tolerance)
 
 
 def estimate_noise(job: Job) -> Job:

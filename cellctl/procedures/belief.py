@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
-from cellctl.calib.chain import PosePrior
 from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.targets import Board
 from cellctl.calib.views import RobotView
@@ -41,7 +40,14 @@ class Belief:
         """With what `views` say; unchanged when there are none."""
         if not views:
             return self
-        found = estimate(views, self.camera, self.T_world_camera, self.T_flange_board)
+        found = estimate(
+            views,
+            self.camera,
+            self.T_world_camera,
+            self.T_flange_board,
+            camera_sigma=self.camera_sigma,
+            board_sigma=self.board_sigma,
+        )
         return replace(self, T_world_camera=found.camera_pose, T_flange_board=found.board_pose)
 
     def seen(self, view: RobotView) -> Array:
@@ -54,8 +60,3 @@ class Belief:
         low, high = board.extent()
         outline = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
         return Rig(self.camera, self.T_world_camera.matrix, self.T_flange_board.matrix, outline)
-
-
-def _prior(pose: Transform, sigma: tuple[float, float]) -> PosePrior:
-    metres, radians = sigma
-    return PosePrior(pose.matrix, np.repeat([radians, metres], 3))

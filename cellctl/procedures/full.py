@@ -6,6 +6,7 @@ what the next one starts from. The verdict is that of all parts together.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -61,8 +62,10 @@ def _record(run: Run, cell: Cell, params: FullParams) -> Record[FullParams]:
 def _next_belief(record: Record[FullParams], start: Knowledge, belief: Belief) -> Belief:
     """What the search for the marker board starts from: the calibrated camera, where the
     checkerboard showed it to hang, and the marker board's pose as it was known."""
-    camera = intrinsic.solve(intrinsic.seen(record.scoped(INTRINSIC, record.params.intrinsic)))
-    found = Knowledge(camera.camera, belief.T_world_camera, calibrated=True, boards=start.boards)
+    checker = intrinsic.seen(record.scoped(INTRINSIC, record.params.intrinsic))
+    camera = intrinsic.solve(checker).camera
+    belief = replace(belief, camera=camera).updated(checker.views)
+    found = Knowledge(camera, belief.T_world_camera, calibrated=True, boards=start.boards)
     return found.belief(record.config, hand_eye.BOARD)
 
 

@@ -265,7 +265,7 @@ def _reachable_views(
         views += found
         road.add(np.array([view.joints for view in found]).reshape(-1, JOINTS))
         bridged = BRIDGES
-        while len(_different(views, road)) < max(2 * count, ENOUGH_CHOICE) and bridged:
+        while len(_different(views, road)) < 2 * count and bridged:
             bridged = bridged - 1 if road.bridge() else 0
         if len(_different(views, road)) >= max(2 * count, ENOUGH_CHOICE):
             break

@@ -77,8 +77,8 @@ def test_predicted_deviations_are_those_of_repeated_solves():
             CAMERA,
             Transform("base", "camera", X),
             Transform("flange", "board", Y),
-            position_m=1.0,
-            angle_deg=100.0,
+            camera_sigma=(1.0, 2.0),
+            board_sigma=(1.0, 2.0),
         )
         for pose, true, part in (
             (found.camera_pose, X, found.covariance[:6, :6]),

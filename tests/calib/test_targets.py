@@ -61,8 +61,8 @@ def test_charuco_is_opencvs(board):
     theirs.setLegacyPattern(board.legacy)
     assert np.allclose(board.points, theirs.getChessboardCorners(), atol=1e-7)
     markers = np.array(theirs.getObjPoints()).reshape(-1, 4, 3)
-    assert np.allclose(list(board._layout.markers.values()), markers[..., :2], atol=1e-7)
-    assert list(board._layout.markers) == np.ravel(theirs.getIds()).tolist()
+    assert np.allclose(list(board.layout.markers.values()), markers[..., :2], atol=1e-7)
+    assert list(board.layout.markers) == np.ravel(theirs.getIds()).tolist()
 
 
 def test_grid_is_opencvs():
