@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,8 @@ COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
 STANDSTILL_RAD_S = 1e-3
+SLACK_M, SLACK_RAD = 0.005, 0.005
+"""Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +95,15 @@ class Guard:
         )
         self._wraps = [body.wrapped() for body in bodies]
         self._pairs = _pairs(bodies)
+
+    def cautious(self, *postures: Array) -> Guard:
+        """A guard that keeps SLACK_M and SLACK_RAD more away from everything, to plan with: its
+        paths are still allowed when the arm stands a little off where it stood at planning. This
+        guard itself where the cautious one would not let the arm be at one of `postures` (6,)."""
+        bodies = tuple(replace(body, radii=body.radii + SLACK_M) for body in self.bodies)
+        margin = self.joint_margin + SLACK_RAD
+        cautious = Guard(self.arm, bodies, self.scene, self.clearance, margin)
+        return cautious if cautious.free(np.array(postures)).all() else self
 
     def free(self, joints: Array) -> Mask:
         """Whether each of joints (n, 6) is allowed."""

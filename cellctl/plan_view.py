@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from cellctl.config import CellConfig
-from cellctl.drivers.base import Path
+from cellctl.drivers.base import Image, Path
 from cellctl.errors import BadInput, MotionRefused
 from cellctl.geometry import Array
 from cellctl.ik import random_starts
@@ -29,12 +29,14 @@ PLANES = {"top (x, y)": (0, 1), "front (x, z)": (0, 2), "side (y, z)": (1, 2)}
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """One part of a procedure: `path` (n, 6) joints as checked, `views` with their rig, if any."""
+    """One part of a procedure: `path` (n, 6) joints as checked; `views` with their rig, or a first
+    `picture` that the projector shows."""
 
     title: str
     path: Array
     views: list[planning.PlannedView]
     rig: planning.Rig | None
+    picture: Image | None = None
 
 
 def plan(config: CellConfig, procedure: str) -> list[Planned]:
@@ -104,21 +106,26 @@ def _park(config: CellConfig, guard: Guard, here: Array) -> Planned:
     path: Path | None = planning.parking(guard, beams, here, margin, 0)
     if path is None:
         raise MotionRefused("projector: no allowed posture leaves the light free")
-    pictures = len(projector.pictures_of(config, projector.ProjectorParams()))
-    return Planned(f"projector ({pictures} pictures)", guard.sample(here, path), [], None)
+    pictures = projector.pictures_of(config, projector.ProjectorParams())
+    title = f"projector ({len(pictures)} pictures)"
+    return Planned(title, guard.sample(here, path), [], None, pictures[0].image)
 
 
 def draw_plan(procedure: str, config: CellConfig, output: FilePath) -> dict[str, Any]:
     """Draw the plan into `output` (PNG, PDF or SVG by its suffix); a summary of it, as JSON."""
     parts = plan(config, procedure)
     guard = guard_of(config)
-    figure = Figure(figsize=(20, 5.5 * len(parts)), layout="constrained")
+    figure = Figure(figsize=(20, 4.6 * len(parts)), layout="constrained")
     axes = figure.subplots(len(parts), len(PLANES) + 1, squeeze=False)
     for row, part in zip(axes, parts, strict=True):
         for axis, (title, plane) in zip(row, PLANES.items(), strict=False):
             _draw_space(axis, config, guard, part, plane)
             axis.set_title(f"{part.title}: {title}, metres")
-        _draw_picture(row[-1], config, part)
+        if part.picture is None:
+            _draw_views(row[-1], config, part)
+        else:
+            row[-1].imshow(part.picture, cmap="gray")
+            row[-1].set_title(f"{part.title}: the first one, projector px")
     try:
         figure.savefig(output, dpi=80)
     except (OSError, ValueError) as error:
@@ -177,7 +184,7 @@ def _corners(part: Planned, view: planning.PlannedView) -> Array:
     return corners @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _draw_picture(axis: Axes, config: CellConfig, part: Planned) -> None:
+def _draw_views(axis: Axes, config: CellConfig, part: Planned) -> None:
     width, height = config.camera.image_size_px
     axis.add_patch(Rectangle((0, 0), width, height, fill=False))
     for number, view in enumerate(part.views, 1):

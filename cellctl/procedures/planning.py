@@ -29,7 +29,9 @@ CONNECT_TRIES = 5
 HUBS_TRIED = 12
 BRIDGES = 2
 ENOUGH_CHOICE = 60
-CANDIDATES, CANDIDATES_PER_VIEW = 900, 40
+CANDIDATES, CANDIDATES_PER_VIEW = 400, 12
+PLACING_ROUNDS = 3
+"""Where a board appears depends on where it is: so often is its place in the picture put right."""
 BATCHES = 3
 PARKING_CANDIDATES = 3000
 PARKING_TRIES = 60
@@ -89,21 +91,26 @@ class PlannedView:
 def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:
     """T_camera_board (count, 4, 4) before the camera, not yet checked against anything.
 
-    The board's middle is spread over the share `middle` of the image, more densely towards its
-    borders (arcsine distribution): distortion shows there. All quarter turns are tried, tilts are
-    about axes of every direction.
+    The board lies where it is wholly in the picture, over the share `middle` of the play that it
+    has there, more often at the ends of it (arcsine distribution): distortion shows there. All
+    quarter turns are tried, tilts are about axes of every direction.
     """
     rng = np.random.default_rng(seed)
-    width, height = rig.camera.image_size
+    size = np.array(rig.camera.image_size)
     side = np.ptp(rig.outline, axis=0).max()
-    depth = rig.camera.K[0, 0] * side / (rng.uniform(*spread.fill, count) * width)
-    share = np.sin(np.pi * rng.uniform(-0.5, 0.5, (count, 2))) * spread.middle
-    middle = np.array([width, height]) * (0.5 + 0.5 * share)
-    rays = np.column_stack([rig.camera.normalise(middle), np.ones(count)])
+    depth = rig.camera.K[0, 0] * side / (rng.uniform(*spread.fill, count) * size[0])
+    share = 0.5 + 0.5 * np.sin(np.pi * rng.uniform(-0.5, 0.5, (count, 2))) * spread.middle
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = _turns(spread, count, rng)
-    centre = np.array([*rig.outline.mean(axis=0), 0.0])
-    poses[:, :3, 3] = rays * depth[:, None] - poses[:, :3, :3] @ centre
+    arm = poses[:, :3, :3] @ np.array([*rig.outline.mean(axis=0), 0.0])
+    middle = np.tile(size / 2, (count, 1))
+    for _ in range(PLACING_ROUNDS):
+        rays = np.column_stack([rig.camera.normalise(middle), np.ones(count)])
+        poses[:, :3, 3] = rays * depth[:, None] - arm
+        pixels = rig.camera.project(rig.board_points(poses))
+        low, high = pixels.min(axis=1), pixels.max(axis=1)
+        play = size - 1 - 2 * spread.edge_px - (high - low)
+        middle += spread.edge_px + share * play - low
     return poses
 
 
@@ -243,6 +250,7 @@ def plan_sweep(
 
     All can be reached from `here` (6,) over lines that the guard allows.
     """
+    guard = guard.cautious(here)
     reached = _reachable_views(rig, guard, here, spread, count, seed)
     chosen = spread_out(rig, reached, 2 * count)
     main, spares = chosen[:count], chosen[count:]
@@ -300,6 +308,7 @@ def reach(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
 
     Tried in this order: straight, over one hub, over several, by RRT-Connect.
     """
+    guard = guard.cautious(here, goal)
     direct = Path(goal[None])
     if guard.allows(here, direct):
         return direct
@@ -338,6 +347,7 @@ def parking(guard: Guard, beams: list[Beam], here: Array, margin: float, seed: i
     Postures are drawn at random; where none keeps the margin, those that come nearest to it are
     taken. None when no posture outside the beams can be reached.
     """
+    guard = guard.cautious(here)
     drawn = np.vstack([here, random_starts(guard.arm, PARKING_CANDIDATES, seed)])
     drawn = drawn[guard.free(drawn)]
     centres, radii = guard.spheres(drawn)

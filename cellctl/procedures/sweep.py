@@ -134,6 +134,7 @@ def next_search(
 ) -> tuple[PlannedView, Path] | None:
     """Pure: the best search view that can be reached from `here`, and the path to it. `visited`
     (n, 6) are postures in which the arm has been."""
+    guard = guard.cautious(here)
     believed = belief.updated(found)
     rig = believed.rig(board)
     had = np.array([believed.seen(view) for view in found]).reshape(-1, 4, 4)
