@@ -53,6 +53,19 @@ def test_first_waypoint_is_checked_from_the_measured_joints(guard, start):
     assert "stands where it must not" in refused(guard, low, start)
 
 
+def test_a_cautious_guard_keeps_further_away(guard, start):
+    posture = start
+    for height in np.arange(0.2, 0.0, -0.003):
+        lower = pen_at(guard, 0.0, -0.45, height, posture)[0]
+        if not guard.free(lower)[0]:
+            break
+        posture = lower
+    strict = guard.cautious(start)
+    assert strict.free(start)[0]
+    assert not strict.free(posture)[0]
+    assert guard.cautious(start, posture) is guard
+
+
 def test_keep_out_is_named():
     document = cells.document()
     document["workspace"]["keep_outs"] = [

@@ -79,6 +79,27 @@ def test_views_are_spread_out(rig, views):
     assert (main[:, :2, 2].max(axis=0) > 0.15).all()
 
 
+def test_corners_of_the_picture_are_filled(rig, guard, here):
+    """Thirty views of the checkerboard come near to all four corners; distortion shows there."""
+    sweep = sweep_of(cells.config(), IntrinsicParams())
+    views = planning.plan_sweep(rig, guard, here, sweep.spread, sweep.count, sweep.seed)
+    seen = rig.camera.project(rig.board_points(poses(views[: sweep.count]))).reshape(-1, 2)
+    width, height = rig.camera.image_size
+    for corner in ((0, 0), (width, 0), (0, height), (width, height)):
+        assert np.linalg.norm(seen - corner, axis=1).min() < 0.15 * width
+
+
+def test_what_a_cautious_guard_allows_is_allowed_from_a_little_beside(guard, here, views):
+    hubs = np.array([view.joints for view in views])
+    rng = np.random.default_rng(0)
+    for view in views[:8]:
+        path = planning.reach(guard, here, view.joints, hubs)
+        assert path is not None
+        for _ in range(5):
+            guard.check(here + rng.uniform(-1e-3, 1e-3, 6), path)
+        here = view.joints
+
+
 def test_the_same_plan_every_time(rig, guard, here, views):
     again = planning.plan_sweep(rig, guard, here, planning.Spread(), 12, seed=0)
     assert np.array_equal(poses(again), poses(views))
