@@ -14,8 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from cellctl.arms import JOINTS
 from cellctl.config import CellConfig
-from cellctl.drivers.base import Image, Path
+from cellctl.drivers.base import Image
 from cellctl.errors import BadInput, MotionRefused
 from cellctl.geometry import Array
 from cellctl.ik import random_starts
@@ -103,7 +104,7 @@ def _route(guard: Guard, here: Array, views: list[planning.PlannedView]) -> Arra
 def _park(config: CellConfig, guard: Guard, here: Array) -> Planned:
     beams = parking.beams(config, known(config, None).T_world_camera)
     margin = parking.MARGIN_M + config.tape.position_m
-    path: Path | None = planning.parking(guard, beams, here, margin, 0)
+    path = parking.way_out(guard, beams, here, np.empty((0, JOINTS)), margin, 0)
     if path is None:
         raise MotionRefused("projector: no allowed posture leaves the light free")
     pictures = projector.pictures_of(config, projector.ProjectorParams())

@@ -2,26 +2,110 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from cellctl.arms import JOINTS
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Path
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array, Transform
-from cellctl.procedures import planning
+from cellctl.ik import random_starts
+from cellctl.motion import Guard
+from cellctl.procedures.routing import Roadmap, shortened
 from cellctl.procedures.sweep import go
 from cellctl.run import Run
 
 MARGIN_M = 0.05
+CANDIDATES, TRIES, BRIDGES = 3000, 60, 4
 PARK, PARKED = "park", "parked"
 
 
-def beams(config: CellConfig, T_world_camera: Transform) -> list[planning.Beam]:
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """What must stay free for a device: the pyramid from `apex` (3,) over `base` (4, 3)."""
+
+    apex: Array
+    base: Array
+
+    def clearance(self, centres: Array, radii: Array) -> Array:
+        """How far the nearest of spheres (n, m, 3) is outside (n,), metres; negative: inside."""
+        edges = self.base - self.apex
+        normals = np.cross(edges, np.roll(edges, -1, axis=0))
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        if normals[0] @ (self.base.mean(axis=0) - self.apex) > 0:
+            normals = -normals
+        outside = (centres - self.apex) @ normals.T
+        return (outside.max(axis=2) - radii).min(axis=1)
+
+
+def way_out(
+    guard: Guard, beams: list[Beam], here: Array, visited: Array, margin: float, seed: int
+) -> Path | None:
+    """Pure: a path to a posture that leaves `margin` metres around all beams, a near one.
+
+    Postures are drawn at random; where none keeps the margin, those that come nearest to it are
+    taken. If none of them can be reached the arm goes back the way it came, over the postures
+    `visited` (n, 6), oldest first. None when that does not lead out of the beams either.
+    """
+    drawn = np.vstack([here, random_starts(guard.arm, CANDIDATES, seed)])
+    return _drawn(guard.cautious(here), beams, here, drawn, margin) or _back(
+        guard, beams, here, visited
+    )
+
+
+def _drawn(
+    guard: Guard, beams: list[Beam], here: Array, drawn: Array, margin: float
+) -> Path | None:
+    """To the first that can be reached of the postures `drawn` (n, 6), nearest first."""
+    drawn = drawn[guard.free(drawn)]
+    clear = clearance(guard, beams, drawn)
+    if not len(drawn) or clear.max() <= 0.0:
+        return None
+    parked = drawn[clear >= min(margin, float(np.sort(clear)[-20:].min()))]
+    if np.array_equal(parked[0], here):
+        return Path(here[None])
+    near = np.argsort(np.abs(parked - here).max(axis=1), kind="stable")[:TRIES]
+    hubs = drawn[np.argsort(np.abs(drawn - here).max(axis=1), kind="stable")[: 2 * TRIES]]
+    road = Roadmap(guard, here, np.vstack([parked[near], hubs]))
+    for _ in range(BRIDGES):
+        reached = [i for i in sorted(road.index) if i < len(near)]
+        if reached:
+            return road.path(here, road.index[reached[0]])
+        if not road.bridge():
+            return None
+    return None
+
+
+def _back(guard: Guard, beams: list[Beam], here: Array, visited: Array) -> Path | None:
+    """Back over `visited`, from where it can be joined, to the last posture that was clear."""
+    clear = clearance(guard, beams, visited) > 0.0
+    for joined in np.argsort(np.abs(visited - here).max(axis=1), kind="stable"):
+        outside = np.flatnonzero(clear[: joined + 1])
+        if not len(outside):
+            continue
+        back = Path(visited[outside[-1] : joined + 1][::-1])
+        if guard.allows(here, back):
+            corners = np.vstack([here, back.waypoints])
+            return Path(shortened(guard, corners, seed=0)[1:])
+    return None
+
+
+def clearance(guard: Guard, beams: list[Beam], joints: Array) -> Array:
+    """How far (n,) the arm at joints (n, 6) stays outside all beams, metres."""
+    if not len(joints):
+        return np.zeros(0)
+    centres, radii = guard.spheres(joints)
+    return np.min([beam.clearance(centres, radii) for beam in beams], axis=0)
+
+
+def beams(config: CellConfig, T_world_camera: Transform) -> list[Beam]:
     """What camera and projector need free to see and light the table's lit area."""
     base = lit_area(config)
     apexes = (T_world_camera.translation, np.array(config.projector.pose.position_m))
-    return [planning.Beam(apex, base) for apex in apexes]
+    return [Beam(apex, base) for apex in apexes]
 
 
 def lit_area(config: CellConfig) -> Array:
@@ -43,8 +127,9 @@ async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> Non
     if recorded is None:
         here = (await cell.robot.read()).joints
         margin = MARGIN_M + cell.config.tape.position_m
+        light = beams(cell.config, T_world_camera)
         path: Path | None = await run.call(
-            planning.parking, cell.guard, beams(cell.config, T_world_camera), here, margin, 0
+            way_out, cell.guard, light, here, _visited(run), margin, 0
         )
         if path is None:
             raise MotionRefused(
@@ -57,3 +142,11 @@ async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> Non
     await run.checkpoint("the arm moves out of the light")
     async with run.taking(key):
         await go(run, cell, way[-1], way)
+
+
+def _visited(run: Run) -> Array:
+    """Corners (n, 6) of all that the arm has gone along in this run, oldest first."""
+    ways = [r["way"] for r in run.records(PARKED)]
+    steps = run.all_samples().values()
+    ways += [s.data["way"] for step in steps for s in step.values() if "way" in s.data]
+    return np.array([corner for way in ways for corner in way]).reshape(-1, JOINTS)

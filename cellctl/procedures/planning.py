@@ -17,7 +17,6 @@ from cellctl.arms import JOINTS
 from cellctl.calib.camera import CameraModel
 from cellctl.drivers.base import Path
 from cellctl.geometry import Array, Mask, invert, transform_points
-from cellctl.ik import random_starts
 from cellctl.motion import Guard
 from cellctl.procedures.routing import Roadmap, connect, nearest_first
 
@@ -33,9 +32,6 @@ CANDIDATES, CANDIDATES_PER_VIEW = 400, 12
 PLACING_ROUNDS = 3
 """Where a board appears depends on where it is: so often is its place in the picture put right."""
 BATCHES = 3
-PARKING_CANDIDATES = 3000
-PARKING_TRIES = 60
-PARKING_BRIDGES = 4
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 SPIRAL_STEP = 0.07
 """Radius of the search spiral's first point, in image widths."""
@@ -321,49 +317,3 @@ def reach(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
     if 0 in road.index:
         return road.path(here, road.index[0])
     return connect(guard, here, goal)
-
-
-@dataclass(frozen=True, eq=False)
-class Beam:
-    """What must stay free for a device: the pyramid from `apex` (3,) over `base` (4, 3)."""
-
-    apex: Array
-    base: Array
-
-    def clearance(self, centres: Array, radii: Array) -> Array:
-        """How far the nearest of spheres (n, m, 3) is outside (n,), metres; negative: inside."""
-        edges = self.base - self.apex
-        normals = np.cross(edges, np.roll(edges, -1, axis=0))
-        normals /= np.linalg.norm(normals, axis=1)[:, None]
-        if normals[0] @ (self.base.mean(axis=0) - self.apex) > 0:
-            normals = -normals
-        outside = (centres - self.apex) @ normals.T
-        return (outside.max(axis=2) - radii).min(axis=1)
-
-
-def parking(guard: Guard, beams: list[Beam], here: Array, margin: float, seed: int) -> Path | None:
-    """A path to a posture that leaves `margin` metres around all beams; the shortest of several.
-
-    Postures are drawn at random; where none keeps the margin, those that come nearest to it are
-    taken. None when no posture outside the beams can be reached.
-    """
-    guard = guard.cautious(here)
-    drawn = np.vstack([here, random_starts(guard.arm, PARKING_CANDIDATES, seed)])
-    drawn = drawn[guard.free(drawn)]
-    centres, radii = guard.spheres(drawn)
-    clear = np.min([beam.clearance(centres, radii) for beam in beams], axis=0)
-    if len(drawn) == 0 or clear.max() <= 0.0:
-        return None
-    parked = drawn[clear >= min(margin, float(np.sort(clear)[-20:].min()))]
-    if np.array_equal(parked[0], here):
-        return Path(here[None])
-    near = np.argsort(np.abs(parked - here).max(axis=1), kind="stable")[:PARKING_TRIES]
-    hubs = drawn[np.argsort(np.abs(drawn - here).max(axis=1), kind="stable")[: 2 * PARKING_TRIES]]
-    road = Roadmap(guard, here, np.vstack([parked[near], hubs]))
-    for _ in range(PARKING_BRIDGES):
-        reached = [i for i in sorted(road.index) if i < len(near)]
-        if reached:
-            return road.path(here, road.index[reached[0]])
-        if not road.bridge():
-            return None
-    return None

@@ -120,7 +120,7 @@ def _found(run: Run, board: Board) -> list[RobotView]:
 
 def _visited(run: Run) -> Array:
     """The postures (n, 6) that the search has been in."""
-    return np.array([s.data["target_joints"] for s in run.samples().values()]).reshape(-1, JOINTS)
+    return np.array([s.data["way"][-1] for s in run.samples().values()]).reshape(-1, JOINTS)
 
 
 def next_search(
@@ -197,18 +197,19 @@ async def _look(
     """Go to a view, take its picture, journal both."""
     await run.checkpoint(f"the arm moves to {key}")
     async with run.taking(key):
-        state = await go(run, cell, view.joints, hubs)
+        state, way = await go(run, cell, view.joints, hubs)
         shot = await shoot(cell, sweep.board, state.t, sweep.limits)
-    await run.sample(key, sample_data(shot, view), {"image": shot.image})
+    await run.sample(key, sample_data(shot, way), {"image": shot.image})
 
 
-def sample_data(shot: Shot, view: PlannedView) -> dict[str, Any]:
-    """What is journalled of a picture of a board: pose, corners, and what is wrong with it."""
+def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
+    """What is journalled of a picture of a board: the way there, pose, corners, and what is wrong
+    with it."""
     return {
         "flaw": shot.flaw,
         "still": shot.still,
         "joints": shot.state.joints.tolist(),
-        "target_joints": view.joints.tolist(),
+        "way": way.waypoints.tolist(),
         "T_world_flange": shot.state.T_world_flange.to_list(),
         "pictures": shot.pictures,
         "t": shot.state.t,
@@ -216,15 +217,16 @@ def sample_data(shot: Shot, view: PlannedView) -> dict[str, Any]:
     }
 
 
-async def go(run: Run, cell: Cell, goal: Array, hubs: Array) -> RobotState:
+async def go(run: Run, cell: Cell, goal: Array, hubs: Array) -> tuple[RobotState, Path]:
     """Move to the joints `goal` (6,) over an allowed path, if need be by way of `hubs` (n, 6);
-    the settled state. MotionRefused when there is no path."""
+    the settled state and that path. MotionRefused when there is none."""
     here = (await cell.robot.read()).joints
     path: Path | None = await run.call(reach, cell.guard, here, goal, hubs)
     if path is None:
         degrees = ", ".join(f"{v:.1f}" for v in np.degrees(goal))
         raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")
-    return await cell.robot.move(Target(path, run.speed), timeout_s=MOVE_TIMEOUT_S / run.speed)
+    timeout_s = MOVE_TIMEOUT_S / run.speed
+    return await cell.robot.move(Target(path, run.speed), timeout_s=timeout_s), path
 
 
 def _view_data(view: PlannedView) -> dict[str, Any]:

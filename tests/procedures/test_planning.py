@@ -15,6 +15,8 @@ from cellctl.procedures.knowledge import known
 from tests import cells
 from tests.postures import free_pen_at
 
+NOWHERE = np.empty((0, 6))
+
 
 @pytest.fixture(scope="module")
 def config():
@@ -159,19 +161,33 @@ def test_no_plan_where_no_view_is_possible(config, guard, here, rig):
 
 def test_parking_leaves_the_light_free(config, guard, here):
     beams = parking.beams(config, known(config, None).T_world_camera)
-    path = planning.parking(guard, beams, here, 0.1, seed=0)
+    path = parking.way_out(guard, beams, here, NOWHERE, 0.1, seed=0)
     assert path is not None
     guard.check(here, path)
     centres, radii = guard.spheres(path.waypoints[-1:])
     assert min(beam.clearance(centres, radii)[0] for beam in beams) >= 0.1
-    stay = planning.parking(guard, beams, path.waypoints[-1], 0.1, seed=0)
+    stay = parking.way_out(guard, beams, path.waypoints[-1], NOWHERE, 0.1, seed=0)
     assert isinstance(stay, Path)
     assert np.array_equal(stay.waypoints[-1], path.waypoints[-1])
 
 
+def test_parking_goes_back_the_way_it_came(guard, config, here, monkeypatch):
+    """Where no posture that is drawn can be reached, the way that led here leads out again."""
+    beams = parking.beams(config, known(config, None).T_world_camera)
+    out = parking.way_out(guard, beams, here, NOWHERE, 0.1, seed=0)
+    assert out is not None
+    came = np.vstack([out.waypoints[::-1], here])
+    monkeypatch.setattr(parking, "BRIDGES", 0)
+    assert parking.way_out(guard, beams, here, NOWHERE, 0.1, seed=0) is None
+    back = parking.way_out(guard, beams, here, came, 0.1, seed=0)
+    assert back is not None
+    guard.check(here, back)
+    assert parking.clearance(guard, beams, back.waypoints[-1:])[0] > 0.0
+
+
 def test_beam_clearance_is_a_distance():
     square = np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
-    beam = planning.Beam(np.array([0.0, 0.0, 1000.0]), square)
+    beam = parking.Beam(np.array([0.0, 0.0, 1000.0]), square)
     centres = np.array([[[3.0, 0.0, 0.0]], [[0.0, 0.5, 0.0]]])
     clearance = beam.clearance(centres, np.array([0.25]))
     assert np.allclose(clearance, (1.75, -0.75), atol=0.01)
