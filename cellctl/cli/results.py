@@ -11,6 +11,7 @@ from cellctl.cli.output import out, say
 from cellctl.messages import RunInfo
 
 MAX_ROWS = 40
+NAME_WIDTH = 26
 
 
 def print_run(run: RunInfo) -> None:
@@ -40,18 +41,25 @@ def print_verdict(verdict: Any, reasons: Any) -> None:
 
 
 def print_data(data: dict[str, Any]) -> None:
-    """Any JSON object: figures by name, rows of equal objects as a table; long lists are cut."""
+    """Any JSON object: figures by name, rows of equal objects as a table. What is long or deep
+    is only counted; `--json` shows it."""
     tables = {name: rows for name, rows in data.items() if _is_table(rows)}
-    for name, value in _figures({k: v for k, v in data.items() if k not in tables}):
-        out.print(f"{name:<26} {value}", markup=False, soft_wrap=True)
+    figures = _figures({k: v for k, v in data.items() if k not in tables})
+    width = max((len(name) for name, _ in figures), default=0)
+    for name, value in figures:
+        out.print(f"{name:<{max(width, NAME_WIDTH)}} {value}", markup=False, soft_wrap=True)
     for name, rows in tables.items():
         print_table(name, rows)
 
 
 def print_table(title: str, rows: list[dict[str, Any]]) -> None:
-    """Rows with the same keys; more than 40 are cut."""
+    """Rows with the same keys; more than 40 are cut, and columns of objects left out."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    columns = list(dict.fromkeys(key for row in rows for key in row))
+    columns = [
+        column
+        for column in dict.fromkeys(key for row in rows for key in row)
+        if not any(isinstance(row.get(column), dict) for row in rows)
+    ]
     for column in columns:
         figures = all(isinstance(row.get(column), int | float | None) for row in rows)
         width = max(len(column), *(len(short(row.get(column))) for row in rows))
@@ -92,7 +100,9 @@ def _short_list(value: list[Any]) -> str:
 def _figures(data: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     lines: list[tuple[str, str]] = []
     for name, value in data.items():
-        if isinstance(value, dict) and value:
+        if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()) and prefix:
+            lines.append((prefix + name, f"({len(value)} items)"))
+        elif isinstance(value, dict) and value:
             lines += _figures(value, f"{prefix}{name}.")
         else:
             lines.append((prefix + name, short(value)))
