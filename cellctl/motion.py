@@ -32,7 +32,6 @@ MAX_STEP_M = 0.01
 COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
-STANDSTILL_RAD_S = 1e-3
 SLACK_M, SLACK_RAD = 0.005, 0.005
 """Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
 
@@ -316,10 +315,10 @@ class GuardedRobot:
         """The measured state at standstill; an arm that still moves, as after a lost link, is
         stopped first. MotionRefused when it goes on moving."""
         state = await self._robot.read()
-        if np.abs(state.speeds).max() > STANDSTILL_RAD_S:
+        if state.standstill_s == 0.0:
             await self._robot.stop(clean=True)
             state = await self._robot.read()
-        if np.abs(state.speeds).max() > STANDSTILL_RAD_S:
+        if state.standstill_s == 0.0:
             raise MotionRefused("the arm is moving though it was stopped; a path starts at rest")
         return state
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -107,8 +107,10 @@ class Arm:
         return self._motion.standstill_at()
 
     def read(self, now: float) -> Reading:
-        """The newest measurement at `now`."""
-        return self._reading(int(np.floor(now / TICK_S + 1e-6)), now)
+        """The newest measurement at `now`. No standstill while a commanded motion is under way,
+        even if nothing has been measured of it yet."""
+        reading = self._reading(int(np.floor(now / TICK_S + 1e-6)), now)
+        return replace(reading, standstill_s=0.0) if now < self.moving_until() else reading
 
     def read_at(self, t: float, now: float) -> Reading:
         """Interpolated between measurements; DeviceFault when `t` is not covered."""

@@ -176,6 +176,26 @@ async def test_a_lost_link_is_a_fault_stops_the_arm_and_heals(paced):
         await cell.robot.move(to(WORK), timeout_s=30)
 
 
+async def test_a_motion_that_has_only_begun_is_no_standstill(endpoint):
+    """The daemon dies in the very tick in which it asked for a motion: nothing measured yet."""
+    async with devices(endpoint) as cell:
+        await cell.robot.move(to(WORK), timeout_s=30)
+        link = Link("daemon", endpoint.cell)
+        await link.request(
+            "robot.move",
+            waypoints=[(WORK + 0.6).tolist()],
+            joint_speed_rad_s=0.7,
+            joint_acceleration_rad_s2=1.4,
+            tool_speed_m_s=0.5,
+        )
+        state = await cell.robot.read()
+        assert not state.speeds.any()
+        assert state.standstill_s == 0.0
+        await link.close()
+        await cell.robot.stop(clean=True)
+        await cell.robot.move(to(WORK), timeout_s=30)
+
+
 async def test_the_arm_stops_when_the_daemon_goes_away(paced):
     async with devices(paced) as cell:
         await cell.robot.move(to(WORK), timeout_s=30)
