@@ -2,7 +2,8 @@
 
 import json
 import sys
-import uuid
+import time
+from typing import Any
 
 import zenoh
 
@@ -13,19 +14,18 @@ config = zenoh.Config.from_json5(
 )
 
 
-def ask(session: zenoh.Session, path: str, **body: object) -> dict:
+def ask(session: zenoh.Session, path: str, **body: object) -> Any:
     for reply in session.get(f"cell/{cell}/@v1/{path}", payload=json.dumps(body), timeout=10):
-        if reply.ok:
-            return json.loads(reply.ok.payload.to_bytes())
-        sys.exit(f"{path}: {reply.err.payload.to_string()}")
+        if reply.ok is None:
+            sys.exit(f"{path}: {reply.err and reply.err.payload.to_string()}")
+        return json.loads(reply.ok.payload.to_bytes())
     sys.exit(f"{path}: nobody answers at {endpoint}")
 
 
 with zenoh.open(config) as session, session.declare_subscriber(f"cell/{cell}/@v1/event") as events:
-    run = ask(session, f"cmd/run/{procedure}", request_id=uuid.uuid4().hex)["run_id"]
-    for sample in events:
-        event = json.loads(sample.payload.to_bytes())
-        print(event["kind"], event["data"])
-        if (event["run_id"], event["kind"]) == (run, "ended"):
-            break
-    print(json.dumps(ask(session, f"get/run/{run}"), indent=2))
+    run = ask(session, f"cmd/run/{procedure}", request_id=f"trigger-{time.time_ns()}")["run_id"]
+    while (info := ask(session, f"get/run/{run}"))["status"] in ("running", "waiting"):
+        while (sample := events.try_recv()) is not None:
+            print(sample.payload.to_string())
+        time.sleep(0.5)
+    print(json.dumps(info, indent=2))
