@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ Positive = Annotated[float, Field(gt=0)]
 Pixels = tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
+LOOPBACK = re.compile(r"tcp/(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
 
 
 def _explained(check: Callable[..., object], *args: Any) -> None:
@@ -57,9 +59,27 @@ class CellSection(Section):
     data_dir: str = "~/.local/share/cellctl"
     motion_enabled: bool = False
 
+    @field_validator("data_dir")
+    @classmethod
+    def _absolute(cls, value: str) -> str:
+        if not Path(value).expanduser().is_absolute():
+            raise ValueError(
+                f"{value!r} would be another folder for each program; write it from / or ~"
+            )
+        return value
+
 
 class BusSection(Section):
     listen: str = DEFAULT_ENDPOINT
+
+    @field_validator("listen")
+    @classmethod
+    def _loopback(cls, value: str) -> str:
+        if not LOOPBACK.fullmatch(value):
+            raise ValueError(
+                f"{value!r} is not tcp/HOST:PORT with a loopback host (127.0.0.1, localhost, [::1])"
+            )
+        return value
 
 
 class SimulationSection(Section):
@@ -179,12 +199,14 @@ class NamedBox(Box):
 
 
 class WorkspaceSection(Section):
-    """Where the arm and all that it carries may be. `clearance_m` is kept from the table, the
-    keep-outs and between links; `device_radius_m` around camera and projector."""
+    """Where the arm and all that it carries may be. `clearance_m` is kept from the table, the walls
+    and the keep-outs, and is three times what lies between two checked states of a path; between
+    links and boards their hulls are all that is kept. `device_radius_m` around camera and
+    projector."""
 
     box: Box
     keep_outs: tuple[NamedBox, ...] = ()
-    clearance_m: Positive = 0.03
+    clearance_m: float = Field(default=0.03, ge=0.03)
     device_radius_m: Positive = 0.12
     joint_margin_deg: float = Field(default=5.0, ge=0, lt=90)
 
@@ -228,6 +250,8 @@ def load_config(path: Path) -> CellConfig:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise BadInput(f"{path}: nested too deeply") from None
     return parse_config(document, str(path))
 
 

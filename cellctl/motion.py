@@ -18,7 +18,7 @@ from cellctl.arms import JOINTS, ArmModel, arm
 from cellctl.config import Box, CellConfig
 from cellctl.drivers.base import Identity, Path, Robot, RobotState, Target
 from cellctl.errors import MotionRefused
-from cellctl.geometry import Array, Mask
+from cellctl.geometry import Array, Mask, invert, rotation_angle
 from cellctl.hulls import Body, box_body, link_bodies, pen_body
 
 FIRST_FREE_FRAME = 2
@@ -32,6 +32,8 @@ MAX_STEP_M = 0.01
 COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
+FLANGE_M, FLANGE_DEG = 0.02, 2.0
+"""An arm's own calibration differs from its data sheet by less."""
 SLACK_M, SLACK_RAD = 0.005, 0.005
 """Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
 
@@ -208,7 +210,9 @@ class Guard:
         wraps = np.concatenate([wrap.world(frames) for wrap in self._wraps], axis=1)
         radii = np.concatenate([wrap.radii for wrap in self._wraps])
         i, j = np.array(self._pairs).T
-        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
+        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (
+            radii[i] + radii[j] + MAX_STEP_M
+        ) ** 2
         for k in np.flatnonzero(near.any(axis=0)):
             one, other = self.bodies[i[k]], self.bodies[j[k]]
             some = frames[near[:, k]]
@@ -313,14 +317,28 @@ class GuardedRobot:
 
     async def _standing(self) -> RobotState:
         """The measured state at standstill; an arm that still moves, as after a lost link, is
-        stopped first. MotionRefused when it goes on moving."""
+        stopped first. MotionRefused when it goes on moving, or is not the arm of the config."""
         state = await self._robot.read()
         if state.standstill_s == 0.0:
             await self._robot.stop(clean=True)
             state = await self._robot.read()
         if state.standstill_s == 0.0:
             raise MotionRefused("the arm is moving though it was stopped; a path starts at rest")
+        self._recognise(state)
         return state
+
+    def _recognise(self, state: RobotState) -> None:
+        """A guard for another arm, or for a flange that the controller has shifted, guards
+        nothing."""
+        expected = self.guard.arm.forward(state.joints)
+        off = invert(expected) @ state.T_world_flange.matrix
+        metres, turn = float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off)))
+        if metres > FLANGE_M or turn > FLANGE_DEG:
+            raise MotionRefused(
+                f"the controller reports its flange {1e3 * metres:.0f} mm and {turn:.1f} degrees "
+                f"from where a {self.guard.arm.name} with these joints has it: another arm than "
+                "the config says, or a TCP or base frame is set there; nothing has moved"
+            )
 
     def _capped(self, start: Array, target: Target) -> float:
         tip = self.guard.tip_speed(start, target.path, self._joint_speed)

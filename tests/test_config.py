@@ -40,6 +40,9 @@ def test_a_sound_document_is_accepted():
         ("config_version", 2, "config_version"),
         ("simulation", None, "motion_enabled: only a cell with"),
         ("cell.id", "No Spaces", "cell.id"),
+        ("cell.data_dir", "data", "cell.data_dir: 'data' would be another folder"),
+        ("bus", {"listen": "tcp/0.0.0.0:7450"}, "bus.listen: .*loopback"),
+        ("workspace.clearance_m", 0.01, "workspace.clearance_m: .*0.03"),
         ("bracket.markers.board", {"type": "hexagons"}, "bracket.markers.board.*hexagons"),
     ],
 )
@@ -47,6 +50,13 @@ def test_bad_documents_are_explained(path, value, words):
     with pytest.raises(BadInput, match=words) as caught:
         parse_config(changed(path, value), "cell.toml")
     assert caught.value.message.startswith("cell.toml: ")
+
+
+def test_nesting_without_end_is_explained(tmp_path):
+    path = tmp_path / "deep.toml"
+    path.write_text("a = " + "[" * 5000 + "]" * 5000)
+    with pytest.raises(BadInput, match="deep.toml: "):
+        load_config(path)
 
 
 def test_missing_key_is_named():

@@ -59,6 +59,17 @@ async def test_a_path_through_the_table_moves_nothing(endpoint):
         await moves_nothing(cell, robot, to(below, here), MotionRefused, "refused at")
 
 
+async def test_another_arm_than_the_config_says_moves_nothing(endpoint):
+    async with devices(endpoint) as cell:
+        document = config()
+        other = document.model_copy(
+            update={"robot": document.robot.model_copy(update={"arm": "irb4600-60/2.05"})}
+        )
+        robot = GuardedRobot(cell.robot, guard_of(other), other, allowed)
+        target = to(await joints(cell) + STEP)
+        await moves_nothing(cell, robot, target, MotionRefused, "another arm")
+
+
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1.01, np.nan])
 async def test_a_speed_that_is_none_moves_nothing(endpoint, speed):
     async with devices(endpoint) as cell:
