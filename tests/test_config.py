@@ -55,7 +55,7 @@ def test_bad_documents_are_explained(path, value, words):
 def test_nesting_without_end_is_explained(tmp_path):
     path = tmp_path / "deep.toml"
     path.write_text("a = " + "[" * 5000 + "]" * 5000)
-    with pytest.raises(BadInput, match="deep.toml: "):
+    with pytest.raises(BadInput, match=r"deep\.toml: "):
         load_config(path)
 
 
