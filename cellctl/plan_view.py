@@ -88,17 +88,24 @@ def _sweep(config: CellConfig, guard: Guard, here: Array, name: str) -> Planned:
             f"{name}: no view of the board is reachable, allowed and in the picture; move the "
             "camera, the bracket or the keep-outs"
         )
-    return Planned(name, _route(guard, here, views[: sweep.count]), views[: sweep.count], rig)
+    route, reached = _route(guard, here, views, sweep.count)
+    return Planned(name, route, reached, rig)
 
 
-def _route(guard: Guard, here: Array, views: list[planning.PlannedView]) -> Array:
+def _route(
+    guard: Guard, here: Array, views: list[planning.PlannedView], count: int
+) -> tuple[Array, list[planning.PlannedView]]:
+    """The path over `count` views, and those views; as in a run, spares replace those that no
+    path leads to."""
     hubs = np.array([view.joints for view in views])
     pieces = [here[None]]
+    reached: list[planning.PlannedView] = []
     for view in views:
         path = planning.reach(guard, pieces[-1][-1], view.joints, hubs)
-        if path is not None:
+        if path is not None and len(reached) < count:
             pieces.append(guard.sample(pieces[-1][-1], path))
-    return np.vstack(pieces)
+            reached.append(view)
+    return np.vstack(pieces), reached
 
 
 def _park(config: CellConfig, guard: Guard, here: Array) -> Planned:

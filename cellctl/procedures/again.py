@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,12 @@ from cellctl.config import parse_config
 from cellctl.errors import BadInput
 from cellctl.procedures import PROCEDURES
 from cellctl.procedures.record import Record
+from cellctl.store import calibrations
+from cellctl.store.files import read_document
 from cellctl.store.run_folder import RecordedRun, read_run
+
+SOLVABLE = ("done",)
+"""A run that was cut short has not seen all that its solver needs."""
 
 
 def solve_run(directory: Path) -> dict[str, Any]:
@@ -23,6 +27,11 @@ def solve_run(directory: Path) -> dict[str, Any]:
     procedure = PROCEDURES.get(run.header.procedure)
     if procedure is None or procedure.conclude is None:
         raise BadInput(f"{directory}: a {run.header.procedure!r} run cannot be solved again")
+    if run.standing.status not in SOLVABLE:
+        raise BadInput(
+            f"{directory}: the run is {run.standing.status}; only one that is done can be solved "
+            f"again (`cellctl run --resume {run.header.run_id}` finishes it)"
+        )
     config = parse_config(run.header.config, str(directory / "run.json"))
     active = _active(directory, run)
     record = Record(
@@ -39,7 +48,9 @@ def _active(directory: Path, run: RecordedRun) -> dict[str, Any] | None:
         return None
     path = directory.absolute().parents[1] / "calibrations" / f"{name}.json"
     try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["calibration"]
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInput(f"{path}: the calibration that the run started from: {error!r}") from None
+        document: dict[str, Any] = read_document(path, calibrations.FILE)["calibration"]
+    except (BadInput, KeyError) as error:
+        raise BadInput(
+            f"{path}: the run started from this calibration, and needs it to be solved: {error}"
+        ) from None
     return document

@@ -57,7 +57,7 @@ async def shoot(cell: Cell, board: Board, after: float, limits: CaptureLimits) -
     frames, flaw = await _still_frames(cell, board, after + limits.rest_s, limits)
     image = mean_image(frames)
     detection = await detect(cell, board, image)
-    state = await cell.robot.state_at(frames[-1].t)
+    state = await cell.robot.state_at(frames[-1].t + frames[-1].exposure_s)
     flaw = flaw or _moving(frames, state)
     still = not flaw
     flaw = flaw or judge_detection(board, detection, image, limits)
@@ -134,16 +134,21 @@ def mean_image(frames: list[Frame]) -> Image:
 
 
 def shift_px(a: Detection, b: Detection) -> float:
-    """Length of the median displacement of the points that both have; infinite without any."""
+    """How far the point of the board that moved furthest has moved, by the similarity that fits
+    all points that both have; infinite with fewer than two. A turn shows as well as a shift."""
     _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
-    if not len(i):
+    if len(i) < 2:
         return float("inf")
-    return float(np.linalg.norm(np.median(b.pixels[j] - a.pixels[i], axis=0)))
+    before, after = (points @ (1.0, 1.0j) for points in (a.pixels[i], b.pixels[j]))
+    design = np.column_stack([before - before.mean(), np.ones(len(i))])
+    change = np.linalg.lstsq(design, after - before, rcond=None)[0]
+    return float(np.abs(design @ change).max())
 
 
 def _moving(frames: list[Frame], state: RobotState) -> str:
-    """Zero speed must have lasted since before the first of the frames."""
-    spanned = frames[-1].t - frames[0].t
+    """Zero speed must have lasted since before the first of the frames; `state` is that at the end
+    of the last one."""
+    spanned = frames[-1].t + frames[-1].exposure_s - frames[0].t
     return "" if state.standstill_s > spanned else "the arm moved while the pictures were taken"
 
 

@@ -33,7 +33,7 @@ class HandEyeParams(BaseModel):
     views: int = Field(default=10, ge=5, le=100)
     search: int = Field(default=16, ge=1, le=100)
     seed: int = Field(default=0, ge=0)
-    max_held_out_px: float = Field(default=5.0, gt=0)
+    max_held_out_px: float = Field(default=2.0, gt=0)
 
 
 def sweep_of(config: CellConfig, params: HandEyeParams) -> sweep.Sweep:

@@ -22,10 +22,10 @@ from cellctl.sim.region import NOWHERE, Region
 
 TILE = 16
 NEAR_M = 0.01
+"""What is nearer than this to a lens's plane is not seen."""
 OUTSIDE = -1.0
 GRAZING = 1e-5
 """Rays that rise less than this over a plane are taken to rise this much."""
-"""What is nearer than this to a lens's plane is not seen."""
 GRID_STEP_PX = 32
 Normal = tuple[Array, Array, Array]
 
