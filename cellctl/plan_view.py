@@ -23,6 +23,7 @@ from cellctl.ik import random_starts
 from cellctl.motion import Guard, guard_of
 from cellctl.procedures import hand_eye, intrinsic, parking, planning, projector
 from cellctl.procedures.knowledge import known
+from cellctl.procedures.rig import PlannedView, Rig
 from cellctl.procedures.sweep import Sweep
 
 PLANES = {"top (x, y)": (0, 1), "front (x, z)": (0, 2), "side (y, z)": (1, 2)}
@@ -35,8 +36,8 @@ class Planned:
 
     title: str
     path: Array
-    views: list[planning.PlannedView]
-    rig: planning.Rig | None
+    views: list[PlannedView]
+    rig: Rig | None
     picture: Image | None = None
 
 
@@ -93,13 +94,13 @@ def _sweep(config: CellConfig, guard: Guard, here: Array, name: str) -> Planned:
 
 
 def _route(
-    guard: Guard, here: Array, views: list[planning.PlannedView], count: int
-) -> tuple[Array, list[planning.PlannedView]]:
+    guard: Guard, here: Array, views: list[PlannedView], count: int
+) -> tuple[Array, list[PlannedView]]:
     """The path over `count` views, and those views; as in a run, spares replace those that no
     path leads to."""
     hubs = np.array([view.joints for view in views])
     pieces = [here[None]]
-    reached: list[planning.PlannedView] = []
+    reached: list[PlannedView] = []
     for view in views:
         path = planning.reach(guard, pieces[-1][-1], view.joints, hubs)
         if path is not None and len(reached) < count:
@@ -184,7 +185,7 @@ def _draw_arm(axis: Axes, guard: Guard, joints: Array, plane: tuple[int, int]) -
         axis.add_patch(Circle((centre[plane[0]], centre[plane[1]]), radius, color="0.5", alpha=0.2))
 
 
-def _corners(part: Planned, view: planning.PlannedView) -> Array:
+def _corners(part: Planned, view: PlannedView) -> Array:
     """The board's outline (5, 3) in the world, closed."""
     assert part.rig is not None
     corners = part.rig.board_points(view.T_camera_board[None])[0][[0, 1, 3, 2, 0]]

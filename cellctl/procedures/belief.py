@@ -15,7 +15,7 @@ from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.targets import Board
 from cellctl.calib.views import RobotView
 from cellctl.geometry import Array, Transform, invert
-from cellctl.procedures.planning import Rig
+from cellctl.procedures.rig import Rig
 
 WELL_KNOWN_M = 0.02
 

@@ -21,7 +21,7 @@ from cellctl.procedures.record import Record, recorded
 from cellctl.run import Procedure, Result, Run
 
 BOARD = "markers"
-SPREAD = Spread(fill=(0.2, 0.35))
+SPREAD = Spread(fill=(0.2, 0.35), about_camera=True)
 
 
 class HandEyeParams(BaseModel):

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from cellctl import ik
 from cellctl.arms import JOINTS
-from cellctl.calib.camera import CameraModel
 from cellctl.drivers.base import Path
 from cellctl.geometry import Array, Mask, invert, transform_points
 from cellctl.motion import Guard
+from cellctl.procedures.choice import about_camera, features, spread_out
+from cellctl.procedures.rig import PlannedView, Rig
 from cellctl.procedures.routing import Roadmap, connect, nearest_first
 
 IK_STARTS = 12
@@ -37,51 +38,18 @@ SPIRAL_STEP = 0.07
 """Radius of the search spiral's first point, in image widths."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """What planning assumes: the camera, where it hangs, and how the board is held.
-
-    `T_world_camera` and `T_flange_board` (4, 4) are estimates; `outline` (4, 2) are the corners
-    of the board's printed area in board metres.
-    """
-
-    camera: CameraModel
-    T_world_camera: Array
-    T_flange_board: Array
-    outline: Array
-
-    def flange(self, T_camera_board: Array) -> Array:
-        """T_world_flange (n, 4, 4) that shows the board at T_camera_board (n, 4, 4)."""
-        return self.T_world_camera @ T_camera_board @ invert(self.T_flange_board)
-
-    def board_points(self, T_camera_board: Array, grid: int = 2) -> Array:
-        """Points (n, grid^2, 3) of the board in the camera frame."""
-        low, high = self.outline.min(axis=0), self.outline.max(axis=0)
-        x, y = (np.linspace(a, b, grid) for a, b in zip(low, high, strict=True))
-        flat = np.stack([*np.meshgrid(x, y), np.zeros((grid, grid))], axis=-1).reshape(-1, 3)
-        turned = np.einsum("nij,mj->nmi", T_camera_board[:, :3, :3], flat)
-        return turned + T_camera_board[:, None, :3, 3]
-
-
 @dataclass(frozen=True)
 class Spread:
     """What candidates look like. Tilts in degrees about an axis in the image plane; `fill` is
     the share of the image's width that the board's longer side may take; `spin_deg` turns it in
-    its own plane."""
+    its own plane. `about_camera` picks views for hand-eye, see `choice.about_camera`."""
 
     tilt_deg: tuple[float, float] = (20.0, 45.0)
     spin_deg: float = 60.0
     fill: tuple[float, float] = (0.22, 0.42)
     middle: float = 1.0
     edge_px: float = 12.0
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedView:
-    """A planned view: how the camera will see the board, and the joints (6,) that show it."""
-
-    T_camera_board: Array
-    joints: Array
+    about_camera: bool = False
 
 
 def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:
@@ -171,40 +139,6 @@ def feasible(
     return [PlannedView(seen[o], j) for o, j in zip(owner[good], joints[good], strict=True)]
 
 
-def spread_out(rig: Rig, views: list[PlannedView], count: int) -> list[PlannedView]:
-    """Up to `count` of `views`, far apart from each other, the most extreme first.
-
-    Farthest-point sampling over where the board is in the picture, how large, how tilted and how
-    spun it is (Gonzalez 1985); deterministic.
-    """
-    if len(views) <= count:
-        return list(views)
-    features = _features(rig, np.array([view.T_camera_board for view in views]))
-    chosen = [int(np.argmax(np.linalg.norm(features - features.mean(axis=0), axis=1)))]
-    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
-    return [views[i] for i in chosen]
-
-
-def _features(rig: Rig, poses: Array) -> Array:
-    """Dimensionless features (n, 7) in which one unit is about equally informative everywhere."""
-    points = rig.board_points(poses)
-    middle = rig.camera.project(points.mean(axis=1)) / np.array(rig.camera.image_size)
-    tilt = poses[:, :2, 2]
-    spin = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    return np.column_stack(
-        [
-            4.0 * middle,
-            1.5 * tilt,
-            0.3 * np.cos(spin),
-            0.3 * np.sin(spin),
-            np.log(points[..., 2].mean(axis=1)),
-        ]
-    )
-
-
 def search_views(
     rig: Rig, guard: Guard, here: Array, step: int, had: Array, edge_px: float, seed: int
 ) -> list[PlannedView]:
@@ -223,8 +157,8 @@ def search_views(
     views = feasible(rig, guard, candidates(rig, tilted, SEARCH_CANDIDATES, seed), here, edge_px)
     if not views:
         return []
-    features = _features(rig, np.array([view.T_camera_board for view in views]))
-    gap = np.linalg.norm(features[:, None] - _features(rig, had), axis=2).min(axis=1)
+    new = features(rig, np.array([view.T_camera_board for view in views]))
+    gap = np.linalg.norm(new[:, None] - features(rig, had), axis=2).min(axis=1)
     return [views[i] for i in np.argsort(-gap, kind="stable")]
 
 
@@ -248,7 +182,10 @@ def plan_sweep(
     """
     guard = guard.cautious(here)
     reached = _reachable_views(rig, guard, here, spread, count, seed)
-    chosen = spread_out(rig, reached, 2 * count)
+    if spread.about_camera:
+        chosen = about_camera(spread_out(rig, reached, 3 * count), count, seed)[: 2 * count]
+    else:
+        chosen = spread_out(rig, reached, 2 * count)
     main, spares = chosen[:count], chosen[count:]
     if not main:
         return []

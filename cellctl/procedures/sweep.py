@@ -25,13 +25,13 @@ from cellctl.procedures.capture import CaptureLimits, Shot, darken, shoot
 from cellctl.procedures.observations import journalled, observation
 from cellctl.procedures.planning import (
     SEARCH_CHOICES,
-    PlannedView,
     Spread,
     first_reached,
     plan_sweep,
     reach,
     search_views,
 )
+from cellctl.procedures.rig import PlannedView
 from cellctl.run import Run
 
 SEARCH_ATTEMPTS, SEARCH_SEEDS = 4, 1000

@@ -12,6 +12,7 @@ from cellctl.motion import guard_of
 from cellctl.procedures import parking, planning
 from cellctl.procedures.intrinsic import IntrinsicParams, sweep_of
 from cellctl.procedures.knowledge import known
+from cellctl.procedures.rig import Rig
 from tests import cells
 from tests.postures import free_pen_at
 
@@ -124,7 +125,7 @@ def test_an_arm_before_the_camera_hides_the_board(rig, guard, views):
     board = transform_points(rig.T_world_camera, rig.board_points(poses([view]))[0].mean(axis=0))
     behind = rig.T_world_camera.copy()
     behind[:3, 3] = elbow + 2.0 * (elbow - board)
-    moved = planning.Rig(rig.camera, behind, rig.T_flange_board, rig.outline)
+    moved = Rig(rig.camera, behind, rig.T_flange_board, rig.outline)
     shown = invert(behind) @ guard.arm.forward(view.joints) @ rig.T_flange_board
     assert not planning.unhidden(moved, guard, shown[None], view.joints[None])[0]
 
@@ -155,7 +156,7 @@ def test_search_widens_from_the_middle(rig, guard, here):
 
 def test_no_plan_where_no_view_is_possible(config, guard, here, rig):
     blind = CameraModel(rig.camera.K, np.zeros(5), (64, 48))
-    away = planning.Rig(blind, rig.T_world_camera, rig.T_flange_board, rig.outline)
+    away = Rig(blind, rig.T_world_camera, rig.T_flange_board, rig.outline)
     assert planning.plan_sweep(away, guard, here, planning.Spread(), 5, seed=0) == []
 
 
