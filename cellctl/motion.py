@@ -8,6 +8,7 @@ config says, and a person's arm is not in the config.
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -298,7 +299,7 @@ class GuardedRobot:
     async def check(self, path: Path) -> None:
         """MotionRefused by the guard, from the measured joints, or by the controller."""
         state = await self._robot.read()
-        self.guard.check(state.joints, path)
+        await asyncio.to_thread(self.guard.check, state.joints, path)
         await self._robot.check(path)
 
     async def move(self, target: Target, *, timeout_s: float) -> RobotState:
@@ -307,7 +308,7 @@ class GuardedRobot:
         if not 0.0 < target.speed <= 1.0:
             raise MotionRefused(f"speed fraction {target.speed} is not in (0, 1]")
         state = await self._standing()
-        self.guard.check(state.joints, target.path)
+        await asyncio.to_thread(self.guard.check, state.joints, target.path)
         await self._robot.check(target.path)
         speed = self._capped(state.joints, target)
         return await self._robot.move(Target(target.path, speed), timeout_s=timeout_s)

@@ -6,6 +6,7 @@ until the board's corners stay where they were, and the mean of the next few is 
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 
 import cv2
@@ -55,7 +56,7 @@ class Shot:
 async def shoot(cell: Cell, board: Board, after: float, limits: CaptureLimits) -> Shot:
     """A picture of a still board; the arm has stood since cell time `after`."""
     frames, flaw = await _still_frames(cell, board, after + limits.rest_s, limits)
-    image = mean_image(frames)
+    image = await asyncio.to_thread(mean_image, frames)
     detection = await detect(cell, board, image)
     state = await cell.robot.state_at(frames[-1].t + frames[-1].exposure_s)
     flaw = flaw or _moving(frames, state)
@@ -97,7 +98,7 @@ async def grab_still(cell: Cell, after: float, count: int, tries: int = 12) -> l
     for _ in range(tries):
         frame = (await grab_frames(cell, after, 1))[0]
         after = frame.t + frame.exposure_s
-        if last is not None and not changed(last.image, frame.image):
+        if last is not None and not await asyncio.to_thread(changed, last.image, frame.image):
             return [frame, *await grab_frames(cell, after, count - 1)]
         last = frame
     raise DeviceFault(

@@ -6,6 +6,7 @@ first one is shown again: what moved in between spoils the result, and is notice
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -89,7 +90,8 @@ async def _take(run: Run, cell: Cell, step: str, shown: list[patterns.MarkerPict
         await run.checkpoint(f"{key} is shown")
         async with run.taking(key):
             on_glass = await cell.projector.show(pattern.image)
-            image = mean_image(await grab_still(cell, on_glass, FRAMES))
+            frames = await grab_still(cell, on_glass, FRAMES)
+            image = await asyncio.to_thread(mean_image, frames)
         found = await run.call(patterns.detect_markers, image, timeout_s=DETECT_TIMEOUT_S)
         _refuse_another_picture(found, pattern.centres)
         await run.sample(key, {"markers": markers_data(found)}, {"image": image})
