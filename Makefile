@@ -5,6 +5,7 @@ BIN    := $(VENV)/bin
 SEED   ?= 0
 SEEDS  ?= 0-9
 KILLS  ?= 30
+JOBS   ?= 2
 
 # One BLAS thread: results are the same to the last digit on one machine, and the solver child
 # does not fight the camera for two cores.
@@ -43,7 +44,7 @@ imports: install
 	$(BIN)/lint-imports
 
 unit: install
-	$(BIN)/pytest
+	$(BIN)/pytest -n $(JOBS) --dist loadfile
 
 soak-kill: install ## SIGKILL the daemon at KILLS random instants, resume, compare
 	$(BIN)/python -m tests.soak.kill --kills $(KILLS) --seed $(SEED)
