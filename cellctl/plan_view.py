@@ -102,7 +102,7 @@ def _route(
     pieces = [here[None]]
     reached: list[PlannedView] = []
     for view in views:
-        path = planning.reach(guard, pieces[-1][-1], view.joints, hubs)
+        path = planning.reach(guard, pieces[-1][-1], view.joints[None], hubs)
         if path is not None and len(reached) < count:
             pieces.append(guard.sample(pieces[-1][-1], path))
             reached.append(view)

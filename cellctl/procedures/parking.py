@@ -141,7 +141,7 @@ async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> Non
     way = np.array(recorded["way"])
     await run.checkpoint("the arm moves out of the light")
     async with run.taking(key):
-        await go(run, cell, way[-1], way)
+        await go(run, cell, way, way)
 
 
 def _visited(run: Run) -> Array:

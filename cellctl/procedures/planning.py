@@ -236,15 +236,23 @@ def first_reached(
     return None
 
 
-def reach(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
-    """An allowed path from `here` to `goal` (6,), if need be over postures of `hubs` (n, 6).
+def reach(guard: Guard, here: Array, way: Array, hubs: Array) -> Path | None:
+    """An allowed path from `here` to the end of `way` (n, 6), if need be over `hubs` (m, 6).
 
-    Tried in this order: straight, over one hub, over several, by RRT-Connect.
+    Tried in this order: straight, by the way as it was planned, over one hub, over several, by
+    RRT-Connect.
     """
-    guard = guard.cautious(here, goal)
-    direct = Path(goal[None])
-    if guard.allows(here, direct):
+    goal = way[-1]
+    direct, planned = Path(goal[None]), Path(way)
+    cautious = guard.cautious(here, goal)
+    if cautious.allows(here, direct):
         return direct
+    if guard.allows(here, planned):
+        return planned
+    return _detour(cautious, here, goal, hubs)
+
+
+def _detour(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
     legs = np.abs(hubs - here).max(axis=1) + np.abs(hubs - goal).max(axis=1)
     for hub in hubs[np.argsort(legs, kind="stable")[:HUBS_TRIED]]:
         detour = Path(np.array([hub, goal]))

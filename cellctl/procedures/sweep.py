@@ -75,8 +75,8 @@ async def search(run: Run, cell: Cell, sweep: Sweep, belief: Belief) -> Belief:
             break
         key = f"look-{i:02}"
         if key not in run.samples():
-            view, way = await _choice(run, cell, sweep, belief, i)
-            await _look(run, cell, sweep, key, view, way)
+            way = await _choice(run, cell, sweep, belief, i)
+            await _look(run, cell, sweep, key, way, way)
     if not found:
         raise SolveError(
             f"the board was not found in {len(run.samples())} poses: is it mounted as the config "
@@ -85,11 +85,8 @@ async def search(run: Run, cell: Cell, sweep: Sweep, belief: Belief) -> Belief:
     return await run.call(belief.updated, found)
 
 
-async def _choice(
-    run: Run, cell: Cell, sweep: Sweep, belief: Belief, i: int
-) -> tuple[PlannedView, Array]:
-    """The next search view and the way to it (n, 6); recalled when they were journalled before a
-    crash."""
+async def _choice(run: Run, cell: Cell, sweep: Sweep, belief: Belief, i: int) -> Array:
+    """The way (n, 6) to the next search view; recalled when it was journalled before a crash."""
     chosen = next((r for r in run.records("choice") if r["index"] == i), None)
     if chosen is None:
         here = (await cell.robot.read()).joints
@@ -108,7 +105,7 @@ async def _choice(
         view, path = found
         chosen = {"index": i, **_view_data(view), "way": path.waypoints.tolist()}
         await run.record("choice", **chosen)
-    return _view_of(chosen), np.array(chosen["way"])
+    return np.array(chosen["way"])
 
 
 def _found(run: Run, board: Board) -> list[RobotView]:
@@ -178,28 +175,26 @@ async def show(run: Run, cell: Cell, sweep: Sweep, plan: list[PlannedView]) -> N
             break
         key = f"view-{i:03}"
         if key not in run.samples():
-            await _look_if_reached(run, cell, sweep, key, view, hubs)
+            await _look_if_reached(run, cell, sweep, key, view.joints[None], hubs)
 
 
 async def _look_if_reached(
-    run: Run, cell: Cell, sweep: Sweep, key: str, view: PlannedView, hubs: Array
+    run: Run, cell: Cell, sweep: Sweep, key: str, way: Array, hubs: Array
 ) -> None:
     """As `_look`; a view that cannot be reached from here is journalled and passed over."""
     try:
-        await _look(run, cell, sweep, key, view, hubs)
+        await _look(run, cell, sweep, key, way, hubs)
     except MotionRefused as refused:
         await run.sample(key, {"flaw": refused.message, "still": False, **observation(None)})
 
 
-async def _look(
-    run: Run, cell: Cell, sweep: Sweep, key: str, view: PlannedView, hubs: Array
-) -> None:
-    """Go to a view, take its picture, journal both."""
+async def _look(run: Run, cell: Cell, sweep: Sweep, key: str, way: Array, hubs: Array) -> None:
+    """Go to the end of `way` (n, 6), take a picture there, journal both."""
     await run.checkpoint(f"the arm moves to {key}")
     async with run.taking(key):
-        state, way = await go(run, cell, view.joints, hubs)
+        state, taken = await go(run, cell, way, hubs)
         shot = await shoot(cell, sweep.board, state.t, sweep.limits)
-    await run.sample(key, sample_data(shot, way), {"image": shot.image})
+    await run.sample(key, sample_data(shot, taken), {"image": shot.image})
 
 
 def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
@@ -217,13 +212,13 @@ def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
     }
 
 
-async def go(run: Run, cell: Cell, goal: Array, hubs: Array) -> tuple[RobotState, Path]:
-    """Move to the joints `goal` (6,) over an allowed path, if need be by way of `hubs` (n, 6);
+async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
+    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6);
     the settled state and that path. MotionRefused when there is none."""
     here = (await cell.robot.read()).joints
-    path: Path | None = await run.call(reach, cell.guard, here, goal, hubs)
+    path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
     if path is None:
-        degrees = ", ".join(f"{v:.1f}" for v in np.degrees(goal))
+        degrees = ", ".join(f"{v:.1f}" for v in np.degrees(way[-1]))
         raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")
     timeout_s = MOVE_TIMEOUT_S / run.speed
     return await cell.robot.move(Target(path, run.speed), timeout_s=timeout_s), path

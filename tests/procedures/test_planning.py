@@ -96,7 +96,7 @@ def test_what_a_cautious_guard_allows_is_allowed_from_a_little_beside(guard, her
     hubs = np.array([view.joints for view in views])
     rng = np.random.default_rng(0)
     for view in views[:8]:
-        path = planning.reach(guard, here, view.joints, hubs)
+        path = planning.reach(guard, here, view.joints[None], hubs)
         assert path is not None
         for _ in range(5):
             guard.check(here + rng.uniform(-1e-3, 1e-3, 6), path)
@@ -111,7 +111,7 @@ def test_the_same_plan_every_time(rig, guard, here, views):
 def test_all_views_can_be_reached_in_order(guard, here, views):
     hubs = np.array([view.joints for view in views])
     for view in views[:12]:
-        path = planning.reach(guard, here, view.joints, hubs)
+        path = planning.reach(guard, here, view.joints[None], hubs)
         assert path is not None
         guard.check(here, path)
         here = view.joints
