@@ -25,6 +25,7 @@ from cellctl.config import parse_config
 from cellctl.drivers import base
 from cellctl.engine import Engine
 from cellctl.errors import CellctlError, DeviceFault
+from cellctl.gate import Gate
 from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
@@ -121,7 +122,7 @@ async def toy_engine(directory: Path) -> AsyncIterator[Engine]:
     guard = guard_of(config)
     cell = Cell(config, guard, still, still, still, MonotonicClock(), still)
     store = await Store.open(directory)
-    engine = Engine(cell, PROCEDURES, store, Permission(directory))
+    engine = Engine(cell, PROCEDURES, store, Gate(Permission(directory)))
     try:
         yield engine
     finally:

@@ -27,6 +27,7 @@ from cellctl.engine import Engine
 from cellctl.engine.active_run import Limits
 from cellctl.engine.bulletin import Published
 from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotEnabled
+from cellctl.gate import Gate
 from cellctl.geometry import Transform
 from cellctl.messages import (
     Accepted,
@@ -53,7 +54,10 @@ LIMITS = Limits(stop_s=0.5, unwind_s=0.3, identity_s=0.3)
 
 
 class ToyRobot:
+    """Asks `allowed` before it moves, as the guarded robot does."""
+
     def __init__(self) -> None:
+        self.allowed: Callable[[], None] = lambda: None
         self.joints = np.zeros(6)
         self.moving = False
         self.moves = 0
@@ -81,6 +85,7 @@ class ToyRobot:
             raise MotionRefused("a joint would leave its range")
 
     async def move(self, target: Target, *, timeout_s: float) -> RobotState:
+        self.allowed()
         await self.check(target.path)
         self.moving = True
         self.moves += 1
@@ -378,8 +383,9 @@ async def bench(
         stack.push_async_callback(store.close)
         devices = (robot, ToyCamera(), ToyProjector())
         cell = Cell(config, guard_of(config), *devices, MonotonicClock(), solver)
-        permission = Permission(directory, always=enabled)
-        engine = Engine(cell, procedures, store, permission, limits=limits, **options)
+        gate = Gate(Permission(directory, always=enabled))
+        robot.allowed = gate.require
+        engine = Engine(cell, procedures, store, gate, limits=limits, **options)
         stack.push_async_callback(engine.shutdown)
         made = Bench(directory, store, engine, robot, solver)
         engine.subscribe(made.seen.append)
