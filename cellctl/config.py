@@ -20,12 +20,11 @@ from cellctl.arms import arm
 from cellctl.calib.targets import board_from_dict
 from cellctl.errors import BadInput
 from cellctl.geometry import Transform
+from cellctl.local import DEFAULT_ENDPOINT
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Pixels = tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
-
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
 
 
 def _explained(check: Callable[..., object], *args: Any) -> None:

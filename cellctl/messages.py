@@ -122,7 +122,8 @@ class RobotSnapshot(Message):
 class State(Message):
     """An immutable snapshot of the daemon, as of event `seq`.
 
-    `enabled`: motion is permitted, until `enabled_until` (wall clock, s; None: without end).
+    `enabled`: motion is permitted, until `enabled_until` (wall clock, s; None: without end). When
+    it is not, `enable_command` is what to type on the cell's machine.
     """
 
     cell: str
@@ -137,6 +138,7 @@ class State(Message):
     active_calibration: str | None = None
     enabled: bool = False
     enabled_until: float | None = None
+    enable_command: str | None = None
     simulated: bool = False
     wall_time: float
 

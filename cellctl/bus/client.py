@@ -11,8 +11,6 @@ apart: `Denied` when a daemon is alive but keeps silent to this caller, else `Un
 
 from __future__ import annotations
 
-import getpass
-import os
 import socket
 import uuid
 from collections.abc import Generator
@@ -24,8 +22,9 @@ from pydantic import ValidationError
 from cellctl.bus.follow import Follower, Update
 from cellctl.bus.keys import Keys, check_name
 from cellctl.bus.queries import Queries, only_cell
-from cellctl.bus.session import DEFAULT_ENDPOINT, Settings, open_connected
+from cellctl.bus.session import Settings, open_connected
 from cellctl.errors import BadInput
+from cellctl.local import DEFAULT_ENDPOINT, user
 from cellctl.messages import (
     Accepted,
     AckRequest,
@@ -168,10 +167,7 @@ class Client:
 
 def _who() -> str:
     """user@host, for the audit trail."""
-    try:
-        return f"{getpass.getuser()}@{socket.gethostname()}"
-    except (KeyError, OSError):  # a user id without a name, as in containers
-        return f"uid{os.getuid()}@{socket.gethostname()}"
+    return f"{user()}@{socket.gethostname()}"
 
 
 C = TypeVar("C", bound=Command)

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from cellctl.bus.client import Client
-from cellctl.bus.session import DEFAULT_ENDPOINT
 from cellctl.errors import BadInput
+from cellctl.local import DEFAULT_ENDPOINT
 
 Connect = Annotated[
     str, typer.Option("--connect", envvar="CELLCTL_CONNECT", help="Where the daemon listens.")

@@ -60,7 +60,8 @@ def detached(run_id: str) -> list[str]:
 def motion(state: State) -> str:
     """Whether the cell may move."""
     if not state.enabled:
-        return "not enabled; on the cell's machine: cellctl enable --for 8h"
+        command = state.enable_command or "cellctl enable --for 8h"
+        return f"not enabled; on the cell's machine: {command}"
     if state.enabled_until is None:
         return "enabled always, by its config"
     return f"enabled until {clock(state.enabled_until)}"

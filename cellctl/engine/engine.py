@@ -107,7 +107,8 @@ class Engine:
 
     def state(self) -> State:
         """A snapshot."""
-        active, until = self._active, self._gate.permission.until()
+        active, permission = self._active, self._gate.permission
+        until = permission.until()
         config = self._cell.config
         return State(
             cell=config.cell.id,
@@ -122,6 +123,7 @@ class Engine:
             active_calibration=self._store.calibrations.active,
             enabled=until is not None,
             enabled_until=None if until is None or math.isinf(until) else until,
+            enable_command=permission.command if until is None else None,
             simulated=config.simulation is not None,
             wall_time=time.time(),
         )

@@ -43,6 +43,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 UNBORN = ".new-"
+LOCK = "lock"
 
 log = structlog.get_logger(__name__)
 
@@ -129,7 +130,7 @@ class Store:
         self._runs = directory / "runs"
         with storage(directory):
             self._runs.mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(directory / "lock")
+        self._lock = _lock(directory / LOCK)
         try:
             with storage(directory):
                 sweep(directory)

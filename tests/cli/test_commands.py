@@ -135,8 +135,10 @@ def test_a_calibration_is_shown_and_promoted(cellctl):
 def test_motion_needs_permission_given_on_this_machine(cellctl, tmp_path, monkeypatch):
     refused = cellctl("run", "move")
     assert refused.code == 4
-    assert "cellctl enable --for 8h" in refused.err
-    assert "cellctl enable" in cellctl("status").out
+    command = f"CELLCTL_DATA={tmp_path} cellctl enable --for 8h"
+    assert refused.err.rstrip().endswith(command)
+    assert command in cellctl("status").out.replace("\n", "")
+    assert cellctl("run", "move", "--json").json["error"]["details"] == {"command": command}
     monkeypatch.setenv("CELLCTL_DATA", str(tmp_path))
     assert cellctl("enable", "--for", "10m").code == 0
     assert permission.Permission(tmp_path).until() == pytest.approx(time.time() + 600, abs=30)

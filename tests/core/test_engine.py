@@ -688,6 +688,27 @@ async def test_procedures_show_their_parameters(toy):
     assert not shown["look-up"].moves
 
 
+async def test_a_run_ends_though_there_is_no_snapshot_to_tell(toy, monkeypatch):
+    """As when the disk that holds the permission fails in the middle of a run."""
+
+    def broken():
+        raise OSError(5, "Input/output error")
+
+    run_id = await toy.start("survey", views=1000)
+    await toy.until(lambda: toy.robot.moving)
+    monkeypatch.setattr(toy.engine, "state", broken)
+    with structlog.testing.capture_logs() as logs:
+        await toy.cancel()
+        await toy.until(lambda: "ended" in toy.events())
+    monkeypatch.undo()
+    assert {line["event"] for line in logs if line["log_level"] == "error"} == {
+        "there is no snapshot of the state"
+    }
+    assert (await toy.engine.run_info(run_id)).status == "cancelled"
+    assert toy.engine.state().phase == "idle"
+    assert toy.robot.stops == [True]
+
+
 # -- the table
 
 
