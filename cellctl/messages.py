@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from cellctl.errors import printable
 
 RunStatus = Literal["running", "waiting", "interrupted", "done", "failed", "cancelled", "abandoned"]
 Verdict = Literal["pass", "fail"]
@@ -20,6 +22,11 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="ignore", ser_json_inf_nan="null", defer_build=True)
     VERSION: ClassVar[int] = 1
     v: Literal[1] = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _can_be_sent(cls, fields: Any) -> Any:
+        return printable(fields)
 
     @classmethod
     def schema_name(cls) -> str:

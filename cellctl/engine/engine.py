@@ -17,7 +17,7 @@ from cellctl.engine.active_run import ActiveRun, Limits
 from cellctl.engine.bulletin import Bulletin, Callback
 from cellctl.engine.ending import Ending
 from cellctl.engine.provenance import look_at, versions
-from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound
+from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound, printable
 from cellctl.gate import Gate
 from cellctl.messages import (
     Accepted,
@@ -158,7 +158,7 @@ class Engine:
     async def run_info(self, run_id: str) -> RunInfo:
         """One run, with its result. NotFound names the newest runs."""
         info = self._info(self._store.folder(run_id))
-        return info.model_copy(update={"result": await self._store.result(run_id)})
+        return info.model_copy(update={"result": printable(await self._store.result(run_id))})
 
     async def calibration(self, calibration_id: str) -> CalibrationInfo:
         """A calibration by its id, or `active`. NotFound lists the known ones."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 
 import pytest
 import structlog
@@ -707,6 +708,31 @@ async def test_a_run_ends_though_there_is_no_snapshot_to_tell(toy, monkeypatch):
     assert (await toy.engine.run_info(run_id)).status == "cancelled"
     assert toy.engine.state().phase == "idle"
     assert toy.robot.stops == [True]
+
+
+STRANGE = os.fsdecode(b"caf\xe9")
+"""The name of a file in Latin-1, as Python has it where names are UTF-8."""
+
+
+async def test_names_that_are_not_utf8_are_recorded_and_told(tmp_path):
+    async with bench(tmp_path / STRANGE) as toy:
+        info = await toy.ended(await toy.start("survey", views=1))
+        assert info.status == "done"
+        assert json.loads(info.model_dump_json())["directory"].endswith(f"runs/{info.run_id}")
+        shown = str(toy.directory).replace("\udce9", r"\udce9")
+        assert info.directory == f"{shown}/runs/{info.run_id}"
+
+
+@pytest.mark.parametrize("kind", ["strange fault", "strange defect"])
+async def test_an_error_about_such_a_name_ends_a_run_as_any_other(toy, kind):
+    with structlog.testing.capture_logs() as logs:
+        info = await toy.ended(await toy.start("troubled", kind=kind))
+    assert "the supervision of a run failed" not in [line["event"] for line in logs]
+    assert r"caf\udce9" in str(info.error)
+    assert toy.journal(info.run_id)[-1].kind == info.status
+    for message in (info, toy.engine.events()):
+        assert r"caf\\udce9" in message.model_dump_json()
+    assert toy.engine.state().model_dump_json()
 
 
 # -- the table

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
@@ -211,6 +212,15 @@ async def _defect(run: Run, params: Trouble) -> None:
     int("seven")
 
 
+async def _strange_fault(run: Run, params: Trouble) -> None:
+    name = os.fsdecode(b"/dev/caf\xe9")
+    raise DeviceFault(f"cannot open {name}", path=name)
+
+
+async def _strange_defect(run: Run, params: Trouble) -> None:
+    Path(os.fsdecode(b"/nowhere/caf\xe9")).read_bytes()  # noqa: ASYNC240 - it is not there
+
+
 async def _child_defect(run: Run, params: Trouble) -> None:
     await run.call(functions.divide_by_zero, timeout_s=20)
 
@@ -281,6 +291,8 @@ TROUBLES = {
     "bad input": _bad_input,
     "fault": _fault,
     "defect": _defect,
+    "strange fault": _strange_fault,
+    "strange defect": _strange_defect,
     "child defect": _child_defect,
     "child death": _child_death,
     "group": _group,
