@@ -71,7 +71,8 @@ class AckRequest(Command):
     """Acknowledges a fault, or answers the operator question of a waiting run.
 
     `question` is the id of the question that is answered: with it, an answer that comes late is
-    refused instead of being taken for another question's, or for a fault's acknowledgement.
+    refused instead of being taken for another question's, or for a fault's acknowledgement. It may
+    be left out only where the question has a single answer.
     """
 
     answer: str = Field(default="ok", max_length=1000)

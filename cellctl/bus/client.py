@@ -138,7 +138,8 @@ class Client:
     def ack(self, answer: str = "ok", *, question: int | None = None) -> Accepted:
         """Acknowledge a fault, or answer the question of a waiting run.
 
-        With the id of the `question` an answer that comes late is refused.
+        With the id of the `question` an answer that comes late is refused; a question that offers
+        a choice has to be named by it.
         """
         request = _made(AckRequest, client=self.label, answer=answer, question=question)
         return self._queries.ask("cmd/ack", Accepted, request)
@@ -153,15 +154,18 @@ class Client:
         )
         return self._queries.ask("cmd/promote", Accepted, request)
 
-    def watch(self, run_id: str | None = None) -> Generator[Update]:
+    def watch(
+        self, run_id: str | None = None, *, give_up_s: float | None = None
+    ) -> Generator[Update]:
         """What happens from now on, or to one run until it ends; outlives the daemon.
 
         With `run_id` the last update is the RunInfo of the run, which has then ended or been
-        interrupted; without, the iterator goes on until it is closed.
+        interrupted; without, the iterator goes on until it is closed. With `give_up_s` it raises
+        Unreachable when the daemon has been silent for so long.
         """
         if run_id is not None:
             self.run_info(run_id)  # NotFound at once, not at the first poll
-        with Follower(self._session, self.keys, self._queries, run_id) as follower:
+        with Follower(self._session, self.keys, self._queries, run_id, give_up_s) as follower:
             yield from follower
 
 

@@ -20,6 +20,12 @@ CellId = Annotated[
     typer.Option("--cell", envvar="CELLCTL_CELL", help="Which cell, if several answer there."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+GiveUp = Annotated[
+    float | None,
+    typer.Option(
+        "--give-up", metavar="SECONDS", min=1.0, help="Wait no longer for a daemon that is gone."
+    ),
+]
 ConfigFile = Annotated[Path, typer.Argument(help="The cell's TOML file.", metavar="CONFIG")]
 
 HERE = DEFAULT_ENDPOINT

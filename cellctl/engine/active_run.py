@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -101,7 +102,8 @@ class ActiveRun:
         return True
 
     def answer(self, request: AckRequest) -> None:
-        """Answer the question. BadInput when it is another one's answer, or not a choice."""
+        """Answer the question. BadInput when it is another one's answer, not a choice, or may be
+        meant for another question: with a choice, the question has to be named."""
         question, future = self.question, self._answer
         if question is None or future is None or future.done():
             raise BadInput("the question was answered already")
@@ -115,6 +117,12 @@ class ActiveRun:
                 f"{request.answer!r} is not an answer to {question.text!r}; choose one of: "
                 f"{', '.join(question.choices)}",
                 choices=question.choices,
+            )
+        if request.question is None and len(question.choices) > 1:
+            raise BadInput(
+                f"say which question is answered; {question.text!r} is number {question.id}: "
+                f"cellctl ack --answer {shlex.quote(request.answer)} --question {question.id}",
+                question=question.id,
             )
         future.set_result(request.answer)
         self.question = None

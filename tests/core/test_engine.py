@@ -12,7 +12,7 @@ import structlog
 from cellctl.engine.bulletin import KEPT, Bulletin
 from cellctl.engine.engine import TRANSITIONS, IllegalTransition, transition
 from cellctl.errors import BadInput, Busy, DeviceFault, NotEnabled, NotFound
-from cellctl.messages import Event, Phase, Progress, PromoteRequest, RunRequest, State
+from cellctl.messages import AckRequest, Event, Phase, Progress, PromoteRequest, RunRequest, State
 from cellctl.permission import enable
 from tests import cells
 from tests.core.toy import ToyRobot, bench
@@ -495,6 +495,17 @@ async def test_a_late_answer_is_not_taken_for_another_questions(toy):
     await toy.ended(run_id)
     with pytest.raises(BadInput, match="is no longer asked"):
         await toy.ack("yes", first.id)
+
+
+async def test_where_there_is_a_choice_the_question_is_named(toy):
+    run_id = await toy.start("asking")
+    question = (await toy.phase("waiting")).question
+    assert question is not None
+    command = f"cellctl ack --answer red --question {question.id}"
+    with pytest.raises(BadInput, match=f"say which question is answered.*{command}"):
+        await toy.engine.ack(AckRequest(answer="red"))
+    await toy.cancel()
+    assert (await toy.ended(run_id)).status == "cancelled"
 
 
 async def test_cancel_while_waiting(toy):

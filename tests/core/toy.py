@@ -351,6 +351,10 @@ class Bench:
         return await self.engine.cancel(CancelRequest(run_id=run_id, client="test"))
 
     async def ack(self, answer: str = "ok", question: int | None = None) -> Accepted:
+        """Acknowledge a fault, or answer the question with this id (None: what is asked now)."""
+        asked = self.engine.state().question
+        if question is None and asked is not None:
+            question = asked.id
         return await self.engine.ack(AckRequest(answer=answer, question=question, client="test"))
 
     async def phase(self, *phases: str) -> State:
