@@ -60,17 +60,19 @@ def no_process_outlives_the_tests() -> Iterator[None]:
     os.environ[name] = value
     yield
     deadline = time.monotonic() + GRACE_S
-    while (left := _marked(f"{name}={value}".encode())) and time.monotonic() < deadline:
+    while (left := processes_with(value)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not left, f"processes left behind by the tests: {', '.join(left)}"
 
 
-def _marked(mark: bytes) -> list[str]:
+def processes_with(mark: str) -> list[str]:
     """The processes, but for this one, with `mark` in their environment."""
     found = []
     for directory in Path("/proc").glob("[0-9]*"):
         try:
-            if mark in (directory / "environ").read_bytes() and directory.name != str(os.getpid()):
+            if mark.encode() in (directory / "environ").read_bytes() and directory.name != str(
+                os.getpid()
+            ):
                 command = (directory / "cmdline").read_bytes().replace(b"\0", b" ")
                 found.append(f"{directory.name} ({command.decode(errors='replace')[:200].strip()})")
         except OSError:  # it has ended, or is somebody else's

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -63,6 +64,12 @@ def _data_dir(config: Path | None) -> Path:
     return default
 
 
+def _exit_once(number: int, _: object) -> None:
+    """So that what the demo has started is ended; a second signal does not hurry it."""
+    signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(128 + number)
+
+
 def demo(
     cell: Annotated[str, typer.Option(help="Which simulated cell: cr.")] = "cr",
     seed: Annotated[int, typer.Option(min=0, help="Draws the cell's true geometry.")] = 0,
@@ -72,6 +79,7 @@ def demo(
     log_to_stderr()
     from cellctl.demo import run_demo
 
+    signal.signal(signal.SIGTERM, _exit_once)
     with ProgressBar() as bar:
         result = run_demo(cell, seed, follow=bar.show)
     if as_json:
