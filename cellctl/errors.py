@@ -14,7 +14,8 @@ def printable(value: Any) -> Any:
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, dict):
-        return {printable(key): printable(item) for key, item in value.items()}
+        names = (printable(key) if isinstance(key, str) else key for key in value)
+        return dict(zip(names, map(printable, value.values()), strict=True))
     if isinstance(value, list | tuple):
         return [printable(item) for item in value]
     return value

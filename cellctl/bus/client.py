@@ -24,6 +24,7 @@ from cellctl.bus.keys import Keys, check_name
 from cellctl.bus.queries import Queries, only_cell
 from cellctl.bus.session import Settings, open_connected
 from cellctl.errors import BadInput
+from cellctl.explain import explain
 from cellctl.local import DEFAULT_ENDPOINT, user
 from cellctl.messages import (
     Accepted,
@@ -182,6 +183,4 @@ def _made(model: type[C], **fields: Any) -> C:
     try:
         return model(**fields)
     except ValidationError as error:
-        item = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in item["loc"])
-        raise BadInput(f"{key}: {item['msg']}") from None
+        raise BadInput(explain(error, model)) from None

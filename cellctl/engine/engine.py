@@ -151,9 +151,10 @@ class Engine:
             ]
         )
 
-    async def runs(self) -> Runs:
-        """All runs, oldest first, without their results."""
-        return Runs(runs=[self._info(folder) for folder in self._store.folders()])
+    async def runs(self, limit: int | None = None) -> Runs:
+        """The newest `limit` runs (None: all), newest first, without their results."""
+        newest = self._store.folders()[::-1][:limit]
+        return Runs(runs=[self._info(folder) for folder in newest])
 
     async def run_info(self, run_id: str) -> RunInfo:
         """One run, with its result. NotFound names the newest runs."""

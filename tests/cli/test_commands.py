@@ -178,7 +178,7 @@ def test_procedures_and_runs_are_listed(cellctl):
     ("arguments", "code", "text"),
     [
         (["run", "nope"], 6, "there are: count, ask, fault, move"),
-        (["run", "count", "--param", "m=1"], 2, "no parameter 'm'"),
+        (["run", "count", "--param", "m=1"], 2, "unknown parameter 'm'"),
         (["run", "count", "--param", "n"], 2, "expected name=value"),
         (["run", "count", "--param", "n=1", "--param", "n=2"], 2, "given twice"),
         (["run", "count", "--speed", "0"], 2, "speed"),

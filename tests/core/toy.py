@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.cell import Cell, Solver
 from cellctl.clock import MonotonicClock
@@ -133,7 +133,11 @@ class ToyProjector:
         return time.monotonic()
 
 
-class ToyParams(BaseModel):
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ToyParams(Params):
     views: int = Field(default=5, ge=1, le=1000)
     scale: float = 1.0
 
@@ -174,6 +178,14 @@ async def chained(run: Run, cell: Cell, params: ToyParams) -> Result:
     return Result("pass", (), {"lines": lines})
 
 
+class NestedParams(Params):
+    survey: ToyParams = ToyParams()
+
+
+async def nested(run: Run, cell: Cell, params: NestedParams) -> Result:
+    return await survey(run.scope("survey"), cell, params.survey)
+
+
 async def asking(run: Run, cell: Cell, params: ToyParams) -> Result:
     colour = await run.ask("Which colour?", ["red", "blue"])
     sure = await run.ask(f"Really {colour}?", ["yes", "no"])
@@ -188,7 +200,7 @@ async def impatient(run: Run, cell: Cell, params: ToyParams) -> Result:
     return await survey(run, cell, params)
 
 
-class Trouble(BaseModel):
+class Trouble(Params):
     kind: str
     seconds: float = 60.0
 
@@ -320,6 +332,7 @@ async def look_up(run: Run, cell: Cell, params: ToyParams) -> Result:
 PROCEDURES = (
     Procedure("survey", "Move, look, solve", ToyParams, moves=True, run=survey),
     Procedure("chained", "Two surveys", ToyParams, moves=True, run=chained),
+    Procedure("nested", "A survey in a scope", NestedParams, moves=True, run=nested),
     Procedure("asking", "Asks twice", ToyParams, moves=False, run=asking),
     Procedure("impatient", "Asks, with a deadline", ToyParams, moves=True, run=impatient),
     Procedure("troubled", "Ends badly", Trouble, moves=True, run=troubled),
