@@ -17,7 +17,6 @@ import structlog
 
 from cellctl.bus.server import Server
 from cellctl.cell import Cell
-from cellctl.clock import Clock
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Frame, Identity, Projector, Robot
 from cellctl.engine import Engine
@@ -76,7 +75,6 @@ async def serve(config: CellConfig) -> AsyncIterator[Engine]:
             robot=GuardedRobot(devices.robot, guard, config, gate.require),
             camera=camera,
             projector=devices.projector,
-            clock=devices.clock,
             solver=solver,
         )
         engine = Engine(cell, list(PROCEDURES.values()), store, gate)
@@ -97,7 +95,6 @@ class Devices:
     robot: Robot
     camera: Camera
     projector: Projector
-    clock: Clock
 
 
 async def _open_devices(
@@ -113,7 +110,7 @@ async def _open_devices(
     projector = SimProjector(endpoint, config, clock)
     for device in (robot, camera, projector):
         stack.push_async_callback(device.close)
-    return Devices(robot, camera, projector, clock)
+    return Devices(robot, camera, projector)
 
 
 async def snapshot(cell: Cell) -> RobotSnapshot:

@@ -20,7 +20,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.cell import Cell, Solver
-from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
 from cellctl.drivers.base import Path as Joints
@@ -411,7 +410,7 @@ async def bench(
         store = await Store.open(directory)
         stack.push_async_callback(store.close)
         devices = (robot, ToyCamera(), ToyProjector())
-        cell = Cell(config, guard_of(config), *devices, MonotonicClock(), solver)
+        cell = Cell(config, guard_of(config), *devices, solver)
         gate = Gate(Permission(directory, always=enabled))
         robot.allowed = gate.require
         engine = Engine(cell, procedures, store, gate, limits=limits, **options)
