@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from cellctl.arms import arm
 from cellctl.cell import Cell, Solver
 from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
@@ -50,6 +51,7 @@ from tests.core import functions
 
 SPEED_RAD_S = 20.0
 PERIOD_S = 0.005
+ARM = arm("ur5")
 LIMITS = Limits(stop_s=0.5, unwind_s=0.3, identity_s=0.3)
 
 
@@ -73,7 +75,7 @@ class ToyRobot:
         return Identity("toy", "bench arm", self.serial)
 
     async def read(self) -> RobotState:
-        pose = Transform.identity("world", "flange")
+        pose = Transform("world", "flange", ARM.forward(self.joints))
         still = 0.0 if self.moving else 1.0
         return RobotState(time.monotonic(), self.joints.copy(), np.zeros(6), pose, still)
 
