@@ -8,7 +8,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import structlog
 
@@ -16,6 +16,7 @@ from cellctl.cell import Cell
 from cellctl.engine.active_run import ActiveRun, Limits
 from cellctl.engine.bulletin import Bulletin, Callback
 from cellctl.engine.ending import Ending
+from cellctl.engine.phases import PhaseEvent, transition
 from cellctl.engine.provenance import look_at, versions
 from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound, printable
 from cellctl.gate import Gate
@@ -40,33 +41,7 @@ from cellctl.run import Procedure
 from cellctl.store.run_folder import RunFolder
 from cellctl.store.store import RunRecord, Store
 
-PhaseEvent = Literal["start", "ask", "answer", "withdraw", "stop", "end", "fault", "ack"]
-
-TRANSITIONS: Mapping[tuple[Phase, PhaseEvent], Phase] = {
-    ("idle", "start"): "running",
-    ("running", "ask"): "waiting",
-    ("waiting", "answer"): "running",
-    ("waiting", "withdraw"): "running",
-    ("running", "stop"): "stopping",
-    ("waiting", "stop"): "stopping",
-    ("stopping", "end"): "idle",
-    ("stopping", "fault"): "fault",
-    ("fault", "ack"): "idle",
-}
-
 log = structlog.get_logger(__name__)
-
-
-class IllegalTransition(Exception):
-    """The program is defective: an event came in a phase that does not know it."""
-
-
-def transition(phase: Phase, event: PhaseEvent) -> Phase:
-    """The next phase; IllegalTransition unless TRANSITIONS has it."""
-    try:
-        return TRANSITIONS[phase, event]
-    except KeyError:
-        raise IllegalTransition(f"{event!r} in phase {phase!r}") from None
 
 
 class Engine:

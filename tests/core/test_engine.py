@@ -10,7 +10,7 @@ import pytest
 import structlog
 
 from cellctl.engine.bulletin import KEPT, Bulletin
-from cellctl.engine.engine import TRANSITIONS, IllegalTransition, transition
+from cellctl.engine.phases import TRANSITIONS, IllegalTransition, transition
 from cellctl.errors import BadInput, Busy, DeviceFault, NotEnabled, NotFound
 from cellctl.messages import AckRequest, Event, Phase, Progress, PromoteRequest, RunRequest, State
 from cellctl.permission import enable
