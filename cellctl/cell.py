@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cellctl.clock import Clock
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Projector, Robot
 from cellctl.motion import Guard
@@ -27,5 +26,4 @@ class Cell:
     robot: Robot
     camera: Camera
     projector: Projector
-    clock: Clock
     solver: Solver

@@ -6,7 +6,6 @@ the fixed x, y, z axes, REP-103). They only have to be right within `[tape]`.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import tomllib
@@ -20,13 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from cellctl.arms import arm
 from cellctl.calib.targets import board_from_dict
 from cellctl.errors import BadInput
+from cellctl.explain import explain
 from cellctl.geometry import Transform
+from cellctl.local import DEFAULT_ENDPOINT
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Pixels = tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]]
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
 LOOPBACK = re.compile(r"tcp/(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
 
 
@@ -260,37 +260,4 @@ def parse_config(document: dict[str, Any], where: str) -> CellConfig:
     try:
         return CellConfig.model_validate(document)
     except ValidationError as error:
-        lines = [_explain(item) for item in error.errors(include_url=False)]
-        raise BadInput(f"{where}: " + "; ".join(lines)) from None
-
-
-def _explain(item: Any) -> str:
-    key = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        return f"unknown key {key!r}{_nearest(item['loc'])}"
-    if item["type"] == "missing":
-        return f"missing key {key!r}"
-    message = str(item["msg"]).removeprefix("Value error, ")
-    return f"{key}: {message}" if key else message
-
-
-def _nearest(location: tuple[Any, ...]) -> str:
-    known = _keys_at(location[:-1])
-    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; known here: {', '.join(known)}"
-
-
-def _keys_at(location: tuple[Any, ...]) -> list[str]:
-    model: Any = CellConfig
-    for part in location:
-        if isinstance(part, int):
-            continue
-        model = _model_in(model.model_fields[part].annotation)
-    return sorted(model.model_fields)
-
-
-def _model_in(annotation: Any) -> Any:
-    """The Section inside an annotation such as `Section | None` or `tuple[Section, ...]`."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(_model_in(part) for part in annotation.__args__ if part is not type(None))
+        raise BadInput(f"{where}: {explain(error, CellConfig)}") from None

@@ -17,10 +17,10 @@ import structlog
 
 from cellctl.bus.server import Server
 from cellctl.cell import Cell
-from cellctl.clock import Clock
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Frame, Identity, Projector, Robot
 from cellctl.engine import Engine
+from cellctl.gate import Gate
 from cellctl.messages import RobotSnapshot
 from cellctl.motion import GuardedRobot, guard_of
 from cellctl.permission import Permission
@@ -60,31 +60,30 @@ async def serve(config: CellConfig) -> AsyncIterator[Engine]:
     DeviceFault (a device does not answer).
     """
     directory = config.data_dir()
-    permission = Permission(directory, always=config.cell.motion_enabled)
+    gate = Gate(Permission(directory, always=config.cell.motion_enabled))
     async with contextlib.AsyncExitStack() as stack:
         store = await Store.open(directory)
         stack.push_async_callback(store.close)
         solver = await stack.enter_async_context(Child("solver", preload=PRELOAD))
         devices = await _open_devices(config, directory, stack)
+        await solver.start()
         camera = Watched(devices.camera)
         guard = guard_of(config)
         cell = Cell(
             config=config,
             guard=guard,
-            robot=GuardedRobot(devices.robot, guard, config, permission.require),
+            robot=GuardedRobot(devices.robot, guard, config, gate.require),
             camera=camera,
             projector=devices.projector,
-            clock=devices.clock,
             solver=solver,
         )
-        engine = Engine(cell, list(PROCEDURES.values()), store, permission)
+        engine = Engine(cell, list(PROCEDURES.values()), store, gate)
         server = Server(
             engine, config.bus.listen, config.cell.id, engine.boot, robot=lambda: snapshot(cell)
         )
         camera.watcher = server
         await stack.enter_async_context(server)
         stack.push_async_callback(engine.shutdown)
-        await solver.start()
         log.info("ready", cell=config.cell.id, boot=engine.boot, data=str(directory))
         yield engine
 
@@ -96,7 +95,6 @@ class Devices:
     robot: Robot
     camera: Camera
     projector: Projector
-    clock: Clock
 
 
 async def _open_devices(
@@ -112,7 +110,7 @@ async def _open_devices(
     projector = SimProjector(endpoint, config, clock)
     for device in (robot, camera, projector):
         stack.push_async_callback(device.close)
-    return Devices(robot, camera, projector, clock)
+    return Devices(robot, camera, projector)
 
 
 async def snapshot(cell: Cell) -> RobotSnapshot:

@@ -16,11 +16,12 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cellctl.bus.client import Client
-from cellctl.bus.follow import Update
+from cellctl.bus.follow import Link, Update
 from cellctl.bus.session import free_endpoint
 from cellctl.calib.calibration import Calibration
 from cellctl.config import load_config
@@ -34,7 +35,21 @@ from cellctl.sim.scoring import Scorer
 
 READY_S = 60.0
 END_S = 30.0
+ENDING_S = 5.0
+"""How long a process that has left the bus may take to end."""
+SILENCE_S = 60.0
+WORLD_IDLE_S = 60.0
+"""After this long without a daemon the world of a demo that was killed ends by itself."""
 FOLDER = Path("demo-data")
+LOG = "daemon.log"
+SERVE = (
+    "import signal, sys\n"
+    "from cellctl.worker.far_side import end_with\n"
+    "end_with(int(sys.argv.pop(1)), signal.SIGTERM)\n"
+    "from cellctl.__main__ import main\n"
+    "sys.exit(main())\n"
+)
+"""`cellctl serve`, which ends as by SIGTERM when the process that started it ends, however."""
 
 
 def run_demo(
@@ -57,8 +72,9 @@ def run_demo(
     folder = (folder or FOLDER / f"{cell}-{seed}-{datetime.now(UTC):%Y%m%dT%H%M%S}").absolute()
     config = write_config(cell, seed, folder)
     try:
-        with daemon(config, folder) as endpoint, Client(endpoint) as client:
-            info = _run(client, procedure, params or {}, follow)
+        with daemon(config, folder) as process, Client(_endpoint(config)) as client:
+            check = partial(_require_alive, process, folder / LOG)
+            info = _run(client, procedure, params or {}, follow, check)
             result = asyncio.run(score(info, _calibration(client, info), folder))
     finally:
         stop_world(folder)
@@ -77,6 +93,7 @@ def write_config(cell: str, seed: int, folder: Path) -> Path:
     """The cell's TOML as an integrator would write it for this seed, on a free port."""
     document = cell_document(PRESETS[cell], seed)
     document["bus"] = {"listen": free_endpoint()}
+    document["simulation"]["idle_exit_s"] = WORLD_IDLE_S
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "cell.toml"
     path.write_text(to_toml(document), encoding="utf-8")
@@ -86,19 +103,20 @@ def write_config(cell: str, seed: int, folder: Path) -> Path:
 def start_daemon(config: Path, folder: Path) -> subprocess.Popen[bytes]:
     """A daemon process that serves `config` with its data in `folder`, ready to be asked.
 
-    Its log goes to `daemon.log` in `folder`. Unreachable when it does not get ready.
+    Its log goes to `daemon.log` in `folder`. Unreachable when it does not get ready. It ends with
+    the thread that calls this.
     """
-    log = folder / "daemon.log"
+    log = folder / LOG
     with log.open("ab") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "cellctl", "serve", str(config)],
+            [sys.executable, "-c", SERVE, str(os.getpid()), "serve", str(config)],
             stdout=sink,
             stderr=sink,
             env={**os.environ, "CELLCTL_DATA": str(folder)},
             start_new_session=True,
         )
     try:
-        _await_ready(process, load_config(config).bus.listen, log)
+        _await_ready(process, _endpoint(config), log)
     except BaseException:
         process.kill()
         process.wait()
@@ -107,21 +125,23 @@ def start_daemon(config: Path, folder: Path) -> subprocess.Popen[bytes]:
 
 
 @contextlib.contextmanager
-def daemon(config: Path, folder: Path) -> Iterator[str]:
-    """As `start_daemon`, stopped at the end of the block; gives its endpoint."""
+def daemon(config: Path, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """As `start_daemon`, stopped at the end of the block."""
     process = start_daemon(config, folder)
     try:
-        yield load_config(config).bus.listen
+        yield process
     finally:
         _end(process)
+
+
+def _endpoint(config: Path) -> str:
+    return load_config(config).bus.listen
 
 
 def _await_ready(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> None:
     deadline = time.monotonic() + READY_S
     while time.monotonic() < deadline:
-        if process.poll() is not None:
-            last = log.read_text(errors="replace").strip().splitlines()[-1:]
-            raise Unreachable(f"the daemon ended with code {process.returncode}: {''.join(last)}")
+        _require_alive(process, log, within_s=0.0)
         with contextlib.suppress(CellctlError), Client(endpoint) as client:
             client.state()
             return
@@ -137,12 +157,30 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
+def _require_alive(process: subprocess.Popen[bytes], log: Path, within_s: float = ENDING_S) -> None:
+    """Unreachable when the daemon's process has ended, or does so within that time."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(within_s)
+    if process.returncode is not None:
+        last = log.read_text(errors="replace").strip().splitlines()[-1:]
+        raise Unreachable(
+            f"the daemon ended with code {process.returncode}; its log {log} ends: {''.join(last)}"
+        )
+
+
 def _run(
-    client: Client, procedure: str, params: dict[str, Any], follow: Callable[[Update], None]
+    client: Client,
+    procedure: str,
+    params: dict[str, Any],
+    follow: Callable[[Update], None],
+    check: Callable[[], None],
 ) -> RunInfo:
+    """The run, ended. `check` is called when the daemon has left the bus."""
     accepted = client.run(procedure, params, request_id=f"demo-{uuid.uuid4().hex[:16]}")
-    for update in client.watch(accepted.run_id):
+    for update in client.watch(accepted.run_id, give_up_s=SILENCE_S):
         follow(update)
+        if isinstance(update, Link) and not update.alive:
+            check()
         if isinstance(update, RunInfo):
             break
     info = client.run_info(accepted.run_id)

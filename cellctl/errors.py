@@ -8,6 +8,19 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 
+def printable(value: Any) -> Any:
+    """`value`, its strings such that every file, terminal and peer takes them: a byte of a path
+    that is not UTF-8 is spelt out as `\\udce9`. Looks into dicts, lists and tuples."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        names = (printable(key) if isinstance(key, str) else key for key in value)
+        return dict(zip(names, map(printable, value.values()), strict=True))
+    if isinstance(value, list | tuple):
+        return [printable(item) for item in value]
+    return value
+
+
 class CellctlError(Exception):
     """Base of all deliberate errors. `details` travels with the error over the bus."""
 
@@ -15,9 +28,9 @@ class CellctlError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, message: str, **details: Any) -> None:
-        super().__init__(message)
-        self.message = message
-        self.details = details
+        self.message: str = printable(message)
+        self.details: dict[str, Any] = printable(details)
+        super().__init__(self.message)
 
 
 class BadInput(CellctlError):

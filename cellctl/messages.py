@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from cellctl.errors import printable
 
 RunStatus = Literal["running", "waiting", "interrupted", "done", "failed", "cancelled", "abandoned"]
 Verdict = Literal["pass", "fail"]
@@ -20,6 +22,11 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="ignore", ser_json_inf_nan="null", defer_build=True)
     VERSION: ClassVar[int] = 1
     v: Literal[1] = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _can_be_sent(cls, fields: Any) -> Any:
+        return printable(fields)
 
     @classmethod
     def schema_name(cls) -> str:
@@ -64,7 +71,8 @@ class AckRequest(Command):
     """Acknowledges a fault, or answers the operator question of a waiting run.
 
     `question` is the id of the question that is answered: with it, an answer that comes late is
-    refused instead of being taken for another question's, or for a fault's acknowledgement.
+    refused instead of being taken for another question's, or for a fault's acknowledgement. It may
+    be left out only where the question has a single answer.
     """
 
     answer: str = Field(default="ok", max_length=1000)
@@ -122,7 +130,8 @@ class RobotSnapshot(Message):
 class State(Message):
     """An immutable snapshot of the daemon, as of event `seq`.
 
-    `enabled`: motion is permitted, until `enabled_until` (wall clock, s; None: without end).
+    `enabled`: motion is permitted, until `enabled_until` (wall clock, s; None: without end). When
+    it is not, `enable_command` is what to type on the cell's machine.
     """
 
     cell: str
@@ -137,6 +146,7 @@ class State(Message):
     active_calibration: str | None = None
     enabled: bool = False
     enabled_until: float | None = None
+    enable_command: str | None = None
     simulated: bool = False
     wall_time: float
 

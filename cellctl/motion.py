@@ -311,6 +311,7 @@ class GuardedRobot:
         await asyncio.to_thread(self.guard.check, state.joints, target.path)
         await self._robot.check(target.path)
         speed = self._capped(state.joints, target)
+        self._permission()  # it may have ended while the robot was asked
         return await self._robot.move(Target(target.path, speed), timeout_s=timeout_s)
 
     async def stop(self, *, clean: bool) -> None:

@@ -6,22 +6,23 @@ no command on the bus that writes it.
 
 from __future__ import annotations
 
-import getpass
 import math
 import re
+import shlex
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from cellctl.errors import BadInput, NotEnabled
+from cellctl.local import user
 from cellctl.store.files import Schema, read_document, storage, write_document
 
 SCHEMA = Schema("cellctl-permission", 1)
 FILE = "motion-permission.json"
 LONGEST_S = 7 * 24 * 3600.0
 CLOCK_TOLERANCE_S = 60.0
-COMMAND = "cellctl enable --for 8h"
 UNITS_S = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
@@ -49,7 +50,7 @@ def enable(directory: Path, duration_s: float, *, now: float | None = None) -> G
     if not 0 < duration_s <= LONGEST_S:
         raise BadInput(f"motion can be enabled for up to {LONGEST_S / 3600:.0f}h at a time")
     since = time.time() if now is None else now
-    grant = Grant(since, since + duration_s, getpass.getuser())
+    grant = Grant(since, since + duration_s, user())
     with storage(directory):
         directory.mkdir(parents=True, exist_ok=True)
     content = {"since": grant.since, "until": grant.until, "by": grant.by}
@@ -63,6 +64,12 @@ class Permission:
     def __init__(self, directory: Path, *, always: bool = False) -> None:
         self._path = directory / FILE
         self._always = always
+        self._grant_read: Grant | None = None
+        self._version: tuple[int, ...] = ()
+        self.command = (
+            f"CELLCTL_DATA={shlex.quote(str(directory.absolute()))} cellctl enable --for 8h"
+        )
+        """What a person types on the cell's machine to permit motion."""
 
     def until(self, now: float | None = None) -> float | None:
         """Wall-clock second at which the permission ends, `inf` for always, None without one."""
@@ -79,34 +86,50 @@ class Permission:
             self._grant(time.time() if now is None else now)
 
     def _grant(self, now: float) -> Grant:
-        if not self._path.exists():
-            raise _not_enabled("motion is not enabled")
-        grant = self._read()
+        grant = self._on_disk()
         if grant.until <= now:
-            raise _not_enabled(f"motion was enabled until {_clock(grant.until)}")
+            raise self._not_enabled(f"motion was enabled until {_clock(grant.until)}")
         if grant.since > now + CLOCK_TOLERANCE_S or grant.until - grant.since > LONGEST_S:
-            raise _not_enabled(
+            raise self._not_enabled(
                 f"{self._path}: enabled from {_clock(grant.since)} to {_clock(grant.until)}: "
                 "the clock was changed, or it was not cellctl that wrote it"
             )
         return grant
 
+    def _on_disk(self) -> Grant:
+        """The grant, read again only when the file is another one: states are told often."""
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            raise self._not_enabled("motion is not enabled") from None
+        except OSError as error:
+            raise self._not_enabled(f"{self._path}: cannot be read: {error.strerror}") from None
+        version = (found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size)
+        if self._grant_read is None or version != self._version:
+            self._grant_read, self._version = self._read(), version
+        return self._grant_read
+
     def _read(self) -> Grant:
         try:
             document = read_document(self._path, SCHEMA)
-            since, until = float(document["since"]), float(document["until"])
+            since, until = _seconds(document["since"]), _seconds(document["until"])
             grant = Grant(since, until, str(document["by"]))
         except BadInput as error:
-            raise _not_enabled(error.message) from None
+            raise self._not_enabled(error.message) from None
         except (KeyError, TypeError, ValueError, OverflowError):
-            raise _not_enabled(f"{self._path}: malformed") from None
-        if not (math.isfinite(grant.since) and math.isfinite(grant.until)):
-            raise _not_enabled(f"{self._path}: malformed")
+            raise self._not_enabled(f"{self._path}: malformed") from None
         return grant
 
+    def _not_enabled(self, reason: str) -> NotEnabled:
+        return NotEnabled(
+            f"{reason}. On the cell's machine type: {self.command}", command=self.command
+        )
 
-def _not_enabled(reason: str) -> NotEnabled:
-    return NotEnabled(f"{reason}. On the cell's machine type: {COMMAND}", command=COMMAND)
+
+def _seconds(value: Any) -> float:
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is no point in time")
+    return float(value)
 
 
 def _clock(seconds: float) -> str:

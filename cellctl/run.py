@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import difflib
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from cellctl.cell import Cell, Solver
 from cellctl.drivers.base import SAMPLE, Image
 from cellctl.errors import BadInput
+from cellctl.explain import explain
 from cellctl.messages import Progress, Verdict
 from cellctl.store.history import Sample, address
 from cellctl.store.store import RunRecord
@@ -73,17 +73,17 @@ class Procedure:
     run: Callable[[Run, Cell, Any], Awaitable[Result]]
     conclude: Callable[[Any], Result] | None = None
 
+    def __post_init__(self) -> None:
+        if self.params.model_config.get("extra") != "forbid":
+            raise ValueError(f"{self.params.__name__}: a misspelt parameter would be ignored")
+
     def parse(self, given: Mapping[str, Any]) -> BaseModel:
         """The parameters, checked. BadInput names the one that is wrong, or unknown and nearest."""
-        known = list(self.params.model_fields)
-        for name in given:
-            if name not in known:
-                raise BadInput(f"{self.name}: no parameter {name!r}{_nearest(name, known)}")
         try:
             return self.params.model_validate(dict(given))
         except ValidationError as error:
-            items = error.errors(include_url=False)
-            raise BadInput(f"{self.name}: " + "; ".join(_explain(item) for item in items)) from None
+            reasons = explain(error, self.params, what="parameter")
+            raise BadInput(f"{self.name}: {reasons}") from None
 
 
 class Host(Protocol):
@@ -135,11 +135,6 @@ class Run:
     @property
     def run_id(self) -> str:
         return self._record.header.run_id
-
-    @property
-    def params(self) -> dict[str, Any]:
-        """The parameters of the run as a whole, as JSON; a procedure gets its own as a model."""
-        return self._record.header.params
 
     @property
     def speed(self) -> float:
@@ -275,17 +270,3 @@ def _named(what: str, name: str) -> str:
     if not NAME.fullmatch(name):
         raise ValueError(f"the name of a {what} is made of A-Z a-z 0-9 _ -, not {name!r}")
     return name
-
-
-def _explain(item: Any) -> str:
-    name = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "missing":
-        return f"parameter {name!r} is missing"
-    return f"{name}: {item['msg']}" if name else str(item["msg"])
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    if close:
-        return f"; did you mean {close[0]!r}?"
-    return f"; it has: {', '.join(known)}" if known else "; it has none"

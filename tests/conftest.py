@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import inspect
 import os
 import threading
 import time
+import uuid
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import pytest
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 GRACE_S = 5.0
+TASK_GRACE_S = 1.0
 
 
 @pytest.fixture(autouse=True)
@@ -28,12 +31,11 @@ def no_leaks() -> Iterator[None]:
     assert not left, f"left behind by the test: {', '.join(left)}"
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Iterator[None]:
-    """Wrap asynchronous tests: a task that is still alive at their end fails them."""
-    if asyncio.iscoroutinefunction(pyfuncitem.obj):
-        pyfuncitem.obj = _checked(pyfuncitem.obj)
-    return (yield)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Wrap asynchronous tests: a task that is still alive at their end fails them. Before
+    pytest-asyncio does, which makes synchronous functions of them."""
+    if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
+        item.obj = _checked(item.obj)
 
 
 def _checked(test: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
@@ -41,11 +43,41 @@ def _checked(test: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
     async def run(*args: Any, **kwargs: Any) -> None:
         before = asyncio.all_tasks()
         await test(*args, **kwargs)
-        await asyncio.sleep(0)
-        left = [task.get_name() for task in asyncio.all_tasks() - before if not task.done()]
-        assert not left, f"tasks left behind by the test: {', '.join(left)}"
+        left = asyncio.all_tasks() - before
+        if left:
+            _, left = await asyncio.wait(left, timeout=TASK_GRACE_S)
+        names = sorted(task.get_name() for task in left)
+        assert not left, f"tasks left behind by the test: {', '.join(names)}"
 
     return run
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_process_outlives_the_tests() -> Iterator[None]:
+    """Fail when a process is left that has cut itself off, as a simulated world does. All that
+    descend from here carry a name of ours in their environment."""
+    name, value = "CELLCTL_TESTS", uuid.uuid4().hex
+    os.environ[name] = value
+    yield
+    deadline = time.monotonic() + GRACE_S
+    while (left := processes_with(value)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not left, f"processes left behind by the tests: {', '.join(left)}"
+
+
+def processes_with(mark: str) -> list[str]:
+    """The processes, but for this one, with `mark` in their environment."""
+    found = []
+    for directory in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (directory / "environ").read_bytes() and directory.name != str(
+                os.getpid()
+            ):
+                command = (directory / "cmdline").read_bytes().replace(b"\0", b" ")
+                found.append(f"{directory.name} ({command.decode(errors='replace')[:200].strip()})")
+        except OSError:  # it has ended, or is somebody else's
+            continue
+    return found
 
 
 def _leaked(threads: set[threading.Thread], children: set[int]) -> list[str]:

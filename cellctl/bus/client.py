@@ -11,8 +11,6 @@ apart: `Denied` when a daemon is alive but keeps silent to this caller, else `Un
 
 from __future__ import annotations
 
-import getpass
-import os
 import socket
 import uuid
 from collections.abc import Generator
@@ -24,8 +22,10 @@ from pydantic import ValidationError
 from cellctl.bus.follow import Follower, Update
 from cellctl.bus.keys import Keys, check_name
 from cellctl.bus.queries import Queries, only_cell
-from cellctl.bus.session import DEFAULT_ENDPOINT, Settings, open_connected
+from cellctl.bus.session import Settings, open_connected
 from cellctl.errors import BadInput
+from cellctl.explain import explain
+from cellctl.local import DEFAULT_ENDPOINT, user
 from cellctl.messages import (
     Accepted,
     AckRequest,
@@ -139,7 +139,8 @@ class Client:
     def ack(self, answer: str = "ok", *, question: int | None = None) -> Accepted:
         """Acknowledge a fault, or answer the question of a waiting run.
 
-        With the id of the `question` an answer that comes late is refused.
+        With the id of the `question` an answer that comes late is refused; a question that offers
+        a choice has to be named by it.
         """
         request = _made(AckRequest, client=self.label, answer=answer, question=question)
         return self._queries.ask("cmd/ack", Accepted, request)
@@ -154,24 +155,24 @@ class Client:
         )
         return self._queries.ask("cmd/promote", Accepted, request)
 
-    def watch(self, run_id: str | None = None) -> Generator[Update]:
+    def watch(
+        self, run_id: str | None = None, *, give_up_s: float | None = None
+    ) -> Generator[Update]:
         """What happens from now on, or to one run until it ends; outlives the daemon.
 
         With `run_id` the last update is the RunInfo of the run, which has then ended or been
-        interrupted; without, the iterator goes on until it is closed.
+        interrupted; without, the iterator goes on until it is closed. With `give_up_s` it raises
+        Unreachable when the daemon has been silent for so long.
         """
         if run_id is not None:
             self.run_info(run_id)  # NotFound at once, not at the first poll
-        with Follower(self._session, self.keys, self._queries, run_id) as follower:
+        with Follower(self._session, self.keys, self._queries, run_id, give_up_s) as follower:
             yield from follower
 
 
 def _who() -> str:
     """user@host, for the audit trail."""
-    try:
-        return f"{getpass.getuser()}@{socket.gethostname()}"
-    except (KeyError, OSError):  # a user id without a name, as in containers
-        return f"uid{os.getuid()}@{socket.gethostname()}"
+    return f"{user()}@{socket.gethostname()}"
 
 
 C = TypeVar("C", bound=Command)
@@ -182,6 +183,4 @@ def _made(model: type[C], **fields: Any) -> C:
     try:
         return model(**fields)
     except ValidationError as error:
-        item = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in item["loc"])
-        raise BadInput(f"{key}: {item['msg']}") from None
+        raise BadInput(explain(error, model)) from None

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from cellctl.bus.keys import Keys, parse_live
 from cellctl.bus.queries import Queries
+from cellctl.errors import Unreachable
 from cellctl.messages import Event, Events, Progress, RunInfo, State
 
 POLL_S = 1.0
@@ -40,12 +41,22 @@ Update = State | Event | Progress | RunInfo | Link
 
 
 class Follower:
-    """Iterates over updates of one run, or of the whole cell when `run_id` is None."""
+    """Iterates over updates of one run, or of the whole cell when `run_id` is None.
+
+    Raises Unreachable when the daemon has been silent for `give_up_s`; None waits for ever.
+    """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, queries: Queries, run_id: str | None
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        queries: Queries,
+        run_id: str | None,
+        give_up_s: float | None = None,
     ) -> None:
         self._session, self._keys, self._queries, self._run_id = session, keys, queries, run_id
+        self._give_up_s = give_up_s
+        self._heard = time.monotonic()
         self._inbox: queue.Queue[zenoh.Sample] = queue.Queue(INBOX)
         self._subscriptions = ExitStack()
         self._boot: str | None = None
@@ -116,6 +127,7 @@ class Follower:
         """The daemon process `boot` is there; another one than before starts its numbers anew."""
         known, was_alive = self._boot, self._alive
         self._boot, self._alive, self._silent = boot, True, 0
+        self._heard = time.monotonic()
         if boot != known:
             self._seen = 0
             self._poll_soon()
@@ -174,6 +186,12 @@ class Follower:
             yield run
 
     def _on_silence(self) -> Iterator[Update]:
+        silence_s = time.monotonic() - self._heard
+        if self._give_up_s is not None and silence_s >= self._give_up_s:
+            raise Unreachable(
+                f"the daemon of {self._keys.cell} has not answered for {silence_s:.0f} s; look at "
+                "its log, and start it again with `cellctl serve`"
+            )
         self._silent += 1
         if self._silent >= SILENT_POLLS and self._alive and self._boot is not None:
             self._alive = False

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import cast
+from typing import Self, cast
 
 import structlog
 import zenoh
@@ -30,6 +30,31 @@ _log = structlog.get_logger(__name__)
 
 def encoding(message: Message) -> zenoh.Encoding:
     return zenoh.Encoding.APPLICATION_JSON.with_schema(message.schema_name())
+
+
+class Outage:
+    """A context manager around one round of a loop that has to go on: what is raised inside does
+    not get out, and the first failure of a row is logged. `over` says that a round succeeded."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._lasts = what, False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> bool:
+        if not isinstance(error, Exception):
+            return False
+        if not self._lasts:
+            trace = None if isinstance(error, CellctlError) else error
+            _log.warning("publishing fails", what=self._what, reason=str(error), exc_info=trace)
+        self._lasts = True
+        return True
+
+    def over(self) -> None:
+        if self._lasts:
+            _log.info("publishing works again", what=self._what)
+        self._lasts = False
 
 
 class Publications:
@@ -67,7 +92,8 @@ class Publications:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._put(self._state, self._engine.state())
+        with Outage("the last state"):
+            self._put(self._state, self._engine.state())
         for publisher in (self._state, self._robot_state, self._event, *self._frames.values()):
             publisher.undeclare()
 
@@ -88,9 +114,13 @@ class Publications:
         else:
             self._put(self._state, message)
 
-    def _put(self, publisher: zenoh.Publisher, message: Message) -> None:
+    def _put(self, publisher: zenoh.Publisher, content: Message | bytes) -> None:
+        """A message, or a picture as JPEG."""
         try:
-            publisher.put(message.model_dump_json(), encoding=encoding(message))
+            if isinstance(content, Message):
+                publisher.put(content.model_dump_json(), encoding=encoding(content))
+            else:
+                publisher.put(content, encoding=zenoh.Encoding.IMAGE_JPEG)
         except zenoh.ZError as error:
             _log.warning("a publication failed", key=str(publisher.key_expr), reason=plain(error))
 
@@ -106,33 +136,34 @@ class Publications:
             _log.warning("a publication failed", run=progress.run_id, reason=plain(error))
 
     async def _repeat_state(self) -> None:
+        outage = Outage("state")
         while True:
-            self._put(self._state, self._engine.state())
+            with outage:
+                self._put(self._state, self._engine.state())
+                outage.over()
             await asyncio.sleep(STATE_S)
 
     async def _repeat_robot(self) -> None:
         """Robot snapshots while somebody watches; an unreadable robot is logged once."""
-        failing = False
+        outage = Outage("robot")
         while self._robot is not None:
             await asyncio.sleep(ROBOT_S)
-            if not _is_watched(self._robot_state):
-                continue
-            try:
-                self._put(self._robot_state, await self._robot())
-                failing = False
-            except CellctlError as error:
-                if not failing:
-                    _log.warning("the robot's state cannot be read", reason=error.message)
-                failing = True
+            with outage:
+                if _is_watched(self._robot_state):
+                    self._put(self._robot_state, await self._robot())
+                    outage.over()
 
     async def _send_previews(self) -> None:
+        outage = Outage("previews")
         while True:
             await self._picture_came.wait()
             self._picture_came.clear()
             pictures, self._pictures = self._pictures, {}
             for camera, image in pictures.items():
-                preview = await asyncio.to_thread(encode_preview, image)
-                self._frames[camera].put(preview, encoding=zenoh.Encoding.IMAGE_JPEG)
+                with outage:
+                    preview = await asyncio.to_thread(encode_preview, image)
+                    self._put(self._frames[camera], preview)
+                    outage.over()
 
 
 def _report_death(task: asyncio.Task[None]) -> None:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from cellctl.bus.keys import LIVE_ANYWHERE, Keys, parse_live
 from cellctl.bus.session import plain
-from cellctl.errors import BY_CODE, BadInput, CellctlError, Denied, Unreachable
+from cellctl.errors import BY_CODE, BadInput, Busy, CellctlError, Denied, Unreachable
 from cellctl.messages import Command, Error, Message
 
 ANSWER_S = 10.0
@@ -28,19 +28,27 @@ class Queries:
         self._session, self._keys, self._endpoint = session, keys, endpoint
 
     def ask(self, path: str, model: type[M], request: Command | None = None) -> M:
-        """The answer to `path`; the daemon's error, Denied or Unreachable is raised."""
+        """The answer to `path`; the daemon's error, Denied or Unreachable is raised. What only
+        reads is asked again when the daemon has too much to answer."""
         for attempt in range(TRIES):
-            message = self._once(path, model, request, ANSWER_S)
+            last = attempt == TRIES - 1
+            try:
+                message = self._once(path, model, request, ANSWER_S)
+            except Busy:
+                if request is not None or last:
+                    raise
+                message = None
             if message is not None:
                 return message
             time.sleep(PAUSE_S * (attempt + 1))
         raise self._silence(path)
 
     def poll(self, path: str, model: type[M], timeout_s: float = 1.0) -> M | None:
-        """One short try; None when nobody answered. The daemon's errors are raised."""
+        """One short try; None when nobody answered, or the daemon has too much to answer. Its
+        other errors are raised."""
         try:
             return self._once(path, model, None, timeout_s)
-        except Unreachable:
+        except (Unreachable, Busy):
             return None
 
     def _once(

@@ -10,7 +10,7 @@ import difflib
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import structlog
 from pydantic import ValidationError
@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from cellctl.bus.keys import check_name
 from cellctl.engine import Engine
 from cellctl.errors import BadInput, CellctlError, NotFound
+from cellctl.explain import explain
 from cellctl.messages import (
     AckRequest,
     CancelRequest,
@@ -27,7 +28,6 @@ from cellctl.messages import (
     PromoteRequest,
     ResumeRequest,
     RunRequest,
-    Runs,
 )
 
 MAX_PAYLOAD_BYTES = 64 * 1024
@@ -91,10 +91,7 @@ async def _procedures(engine: Engine, _argument: str, _request: Request) -> Mess
 
 async def _runs(engine: Engine, _argument: str, request: Request) -> Message:
     """The newest `limit` runs, newest first; results are left to `get/run/{id}`."""
-    known = (await engine.runs()).runs
-    newest = sorted(known, key=lambda run: run.run_id, reverse=True)
-    limit = _count(request, "limit", DEFAULT_RUNS)
-    return Runs(runs=[run.model_copy(update={"result": None}) for run in newest[:limit]])
+    return await engine.runs(_count(request, "limit", DEFAULT_RUNS))
 
 
 async def _run(engine: Engine, run_id: str, _request: Request) -> Message:
@@ -179,10 +176,5 @@ def _body(model: type[C], request: Request) -> C:
     try:
         return model.model_validate_json(request.payload or b"{}")
     except ValidationError as error:
-        reasons = "; ".join(_explain(item) for item in error.errors(include_url=False)[:5])
+        reasons = explain(error, model, most=5)
         raise BadInput(f"{request.path}: {reasons}"[:MAX_TEXT]) from None
-
-
-def _explain(item: Any) -> str:
-    key = ".".join(str(part) for part in item["loc"])
-    return f"{key}: {item['msg']}" if key else str(item["msg"])

@@ -15,8 +15,8 @@ from collections.abc import Mapping
 import zenoh
 
 from cellctl.errors import BadInput, Unreachable
+from cellctl.local import DEFAULT_ENDPOINT
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7450"
 MAX_REQUEST_BYTES = 1 << 20
 MAX_ANSWER_BYTES = 64 << 20
 

@@ -77,10 +77,10 @@ def _bar() -> rich.progress.Progress:
     )
 
 
-def follow(client: Client, run_id: str) -> RunInfo:
-    """Show a run until it ends or is interrupted."""
+def follow(client: Client, run_id: str, give_up_s: float | None = None) -> RunInfo:
+    """Show a run until it ends or is interrupted; Unreachable as of `Client.watch`."""
     with ProgressBar() as bar:
-        for update in client.watch(run_id):
+        for update in client.watch(run_id, give_up_s=give_up_s):
             if isinstance(update, RunInfo):
                 return update
             bar.show(update)
@@ -92,6 +92,6 @@ def _tell(update: Update) -> None:
     if isinstance(update, Event) and update.kind in TOLD:
         note(words.event(update, of_one_run=True))
         for choice in update.data.get("choices", []):
-            note(f"  to answer: {words.answer_command(str(choice))}")
+            note(f"  to answer: {words.answer_command(str(choice), update.data.get('id'))}")
     elif isinstance(update, Link):
         note(words.link(update))

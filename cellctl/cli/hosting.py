@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ from cellctl.cli.logs import log_to_stderr
 from cellctl.cli.options import AsJson, ConfigFile
 from cellctl.cli.output import emit, say
 from cellctl.cli.results import print_data, print_table, print_verdict
+from cellctl.errors import BadInput
 
 
 def serve(config: ConfigFile) -> int:
@@ -28,7 +30,7 @@ def serve(config: ConfigFile) -> int:
 def enable(
     duration: Annotated[str, typer.Option("--for", help="As 8h, 90m or 1h30m.")] = "8h",
     config: Annotated[
-        Path | None, typer.Option(help="The cell's TOML file, if its data_dir is its own.")
+        Path | None, typer.Option(help="The cell's TOML file, which says where its data are.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -44,13 +46,28 @@ def enable(
 
 
 def _data_dir(config: Path | None) -> Path:
-    """Of the config; else CELLCTL_DATA; else where every cell's data are by default."""
+    """Of the config; else CELLCTL_DATA; else where every cell's data are by default, which has to
+    be where a daemon has kept some: a permission that no daemon reads would only look like one."""
     from cellctl.config import CellSection, load_config
+    from cellctl.store.store import LOCK
 
     if config is not None:
         return load_config(config).data_dir()
-    default: str = CellSection.model_fields["data_dir"].default
-    return Path(os.environ.get("CELLCTL_DATA") or default).expanduser()
+    if given := os.environ.get("CELLCTL_DATA"):
+        return Path(given).expanduser()
+    default = Path(CellSection.model_fields["data_dir"].default).expanduser()
+    if not (default / LOCK).exists():
+        raise BadInput(
+            f"no daemon keeps its data in {default}; say which cell is meant: "
+            "`cellctl enable --config CELL.toml`, or type what `cellctl status` shows"
+        )
+    return default
+
+
+def _exit_once(number: int, _: object) -> None:
+    """So that what the demo has started is ended; a second signal does not hurry it."""
+    signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(128 + number)
 
 
 def demo(
@@ -62,6 +79,7 @@ def demo(
     log_to_stderr()
     from cellctl.demo import run_demo
 
+    signal.signal(signal.SIGTERM, _exit_once)
     with ProgressBar() as bar:
         result = run_demo(cell, seed, follow=bar.show)
     if as_json:

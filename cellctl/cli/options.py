@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from cellctl.bus.client import Client
-from cellctl.bus.session import DEFAULT_ENDPOINT
 from cellctl.errors import BadInput
+from cellctl.local import DEFAULT_ENDPOINT
 
 Connect = Annotated[
     str, typer.Option("--connect", envvar="CELLCTL_CONNECT", help="Where the daemon listens.")
@@ -20,6 +20,12 @@ CellId = Annotated[
     typer.Option("--cell", envvar="CELLCTL_CELL", help="Which cell, if several answer there."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+GiveUp = Annotated[
+    float | None,
+    typer.Option(
+        "--give-up", metavar="SECONDS", min=1.0, help="Wait no longer for a daemon that is gone."
+    ),
+]
 ConfigFile = Annotated[Path, typer.Argument(help="The cell's TOML file.", metavar="CONFIG")]
 
 HERE = DEFAULT_ENDPOINT

@@ -50,7 +50,8 @@ def _print_state(state: State, endpoint: str) -> None:
 
 def _commands(state: State) -> str | None:
     if state.question:
-        return "\n".join(words.answer_command(choice) for choice in state.question.choices)
+        asked = state.question
+        return "\n".join(words.answer_command(choice, asked.id) for choice in asked.choices)
     return "when it is put right: cellctl ack" if state.phase == "fault" else None
 
 

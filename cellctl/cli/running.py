@@ -13,7 +13,7 @@ from cellctl.bus.client import Client
 from cellctl.bus.follow import Update
 from cellctl.cli import words
 from cellctl.cli.display import ProgressBar, follow
-from cellctl.cli.options import HERE, AsJson, CellId, Connect, connect, parse_params
+from cellctl.cli.options import HERE, AsJson, CellId, Connect, GiveUp, connect, parse_params
 from cellctl.cli.output import emit, note, say
 from cellctl.cli.results import print_run
 from cellctl.errors import BadInput, CellctlError
@@ -44,6 +44,7 @@ def run(
         str | None, typer.Option(help="The same id again is the same run, not another.")
     ] = None,
     detach: Annotated[bool, typer.Option("--detach", help="Do not wait for the end.")] = False,
+    give_up: GiveUp = None,
     as_json: AsJson = False,
     endpoint: Connect = HERE,
     cell: CellId = None,
@@ -61,7 +62,7 @@ def run(
             raise BadInput("name a procedure, or a run with --resume; see `cellctl procedures`")
         if detach:
             return _say_started(accepted, as_json)
-        return _wait(client, accepted, as_json)
+        return _wait(client, accepted, give_up, as_json)
 
 
 def _resume(client: Client, run_id: str, procedure: str | None) -> RunAccepted:
@@ -78,11 +79,11 @@ def _say_started(accepted: RunAccepted, as_json: bool) -> int:
     return 0
 
 
-def _wait(client: Client, accepted: RunAccepted, as_json: bool) -> int:
+def _wait(client: Client, accepted: RunAccepted, give_up: float | None, as_json: bool) -> int:
     if accepted.replayed:
         note(f"this is run {accepted.run_id}, which was started before")
     try:
-        ended = follow(client, accepted.run_id)
+        ended = follow(client, accepted.run_id, give_up)
     except KeyboardInterrupt:
         for text in words.detached(accepted.run_id):
             note(text)
@@ -98,6 +99,11 @@ def conclude(run: RunInfo, as_json: bool) -> int:
         emit(run)
     else:
         print_run(run)
+    return exit_code(run)
+
+
+def exit_code(run: RunInfo) -> int:
+    """Of a run that has ended."""
     return 0 if run.status == "done" and run.verdict != "fail" else 1
 
 
@@ -106,21 +112,24 @@ def watch(
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object a line, for each update.")
     ] = False,
+    give_up: GiveUp = None,
     endpoint: Connect = HERE,
     cell: CellId = None,
 ) -> int:
     """Follow the cell until Ctrl-C, or one run until it ends, also over a daemon's restart."""
     try:
         with connect(endpoint, cell) as client, ProgressBar() as bar:
-            for update in _news(client.watch(run_id)):
-                if isinstance(update, RunInfo):
-                    return conclude(update, as_json)
+            for update in _news(client.watch(run_id, give_up_s=give_up)):
                 bar.show(update)
                 if as_json:
                     fields = update.model_dump() if isinstance(update, BaseModel) else vars(update)
                     emit({"type": type(update).__name__, **fields})
+                elif isinstance(update, RunInfo):
+                    print_run(update)
                 elif text := words.line(update):
                     bar.say(text)
+                if isinstance(update, RunInfo):
+                    return exit_code(update)
     except KeyboardInterrupt:
         pass
     return 0
@@ -156,14 +165,16 @@ def cancel(
 
 def ack(
     answer: Annotated[str, typer.Option(help="One of the answers that the run offers.")] = "ok",
+    question: Annotated[
+        int | None, typer.Option(help="The number of the question that is answered.")
+    ] = None,
     as_json: AsJson = False,
     endpoint: Connect = HERE,
     cell: CellId = None,
 ) -> None:
     """Answer the question of a waiting run, or acknowledge a fault."""
     with connect(endpoint, cell) as client:
-        question = client.state().question
-        accepted = client.ack(answer, question=question.id if question else None)
+        accepted = client.ack(answer, question=question)
     if as_json:
         emit(accepted)
     else:

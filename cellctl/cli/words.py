@@ -42,11 +42,13 @@ def advice(run: RunInfo) -> list[str]:
 
 
 def how_to_answer(question: Question) -> list[str]:
-    return [f"answer:   {answer_command(choice)}" for choice in question.choices]
+    return [f"answer:   {answer_command(choice, question.id)}" for choice in question.choices]
 
 
-def answer_command(choice: str) -> str:
-    return f"cellctl ack --answer {shlex.quote(choice)}"
+def answer_command(choice: str, question: int | None) -> str:
+    """The number is in it so that a command that is typed late answers nothing else."""
+    number = "" if question is None else f" --question {question}"
+    return f"cellctl ack --answer {shlex.quote(choice)}{number}"
 
 
 def detached(run_id: str) -> list[str]:
@@ -60,7 +62,8 @@ def detached(run_id: str) -> list[str]:
 def motion(state: State) -> str:
     """Whether the cell may move."""
     if not state.enabled:
-        return "not enabled; on the cell's machine: cellctl enable --for 8h"
+        command = state.enable_command or "cellctl enable --for 8h"
+        return f"not enabled; on the cell's machine: {command}"
     if state.enabled_until is None:
         return "enabled always, by its config"
     return f"enabled until {clock(state.enabled_until)}"

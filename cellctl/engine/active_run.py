@@ -4,7 +4,9 @@ the journal says how, and a person is told when something is left to look at."""
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -14,6 +16,7 @@ from cellctl.cell import Cell
 from cellctl.engine.bulletin import Bulletin
 from cellctl.engine.ending import Ending, ending_of
 from cellctl.errors import BadInput, CellctlError, StorageFault
+from cellctl.gate import Gate
 from cellctl.messages import AckRequest, Progress, Question, RunStatus
 from cellctl.run import Procedure, Result, Run, StepCancelled
 from cellctl.store.files import utc_now
@@ -55,6 +58,7 @@ class ActiveRun:
         procedure: Procedure,
         cell: Cell,
         store: Store,
+        gate: Gate,
         bulletin: Bulletin,
         fire: Callable[[RunEvent], None],
         limits: Limits,
@@ -68,6 +72,7 @@ class ActiveRun:
         self._params = procedure.parse(record.header.params)
         self._cell = cell
         self._store = store
+        self._gate = gate
         self._bulletin = bulletin
         self._fire = fire
         self._limits = limits
@@ -97,7 +102,8 @@ class ActiveRun:
         return True
 
     def answer(self, request: AckRequest) -> None:
-        """Answer the question. BadInput when it is another one's answer, or not a choice."""
+        """Answer the question. BadInput when it is another one's answer, not a choice, or may be
+        meant for another question: with a choice, the question has to be named."""
         question, future = self.question, self._answer
         if question is None or future is None or future.done():
             raise BadInput("the question was answered already")
@@ -112,6 +118,12 @@ class ActiveRun:
                 f"{', '.join(question.choices)}",
                 choices=question.choices,
             )
+        if request.question is None and len(question.choices) > 1:
+            raise BadInput(
+                f"say which question is answered; {question.text!r} is number {question.id}: "
+                f"cellctl ack --answer {shlex.quote(request.answer)} --question {question.id}",
+                question=question.id,
+            )
         future.set_result(request.answer)
         self.question = None
         self._fire("answer")
@@ -124,13 +136,24 @@ class ActiveRun:
             ending = _with_fault(ending, await self._halt(clean=ending.fault is None))
         return await self._close(ending)
 
-    def forsake(self, problem: str) -> Ending:
-        """The ending for a defect in the supervision itself. The journal is left as it is."""
+    async def forsake(self, problem: str) -> Ending:
+        """The ending for a defect in the supervision itself. The arm is stopped, the procedure
+        cancelled, and the journal closed as it is; whatever fails of that, the rest is done."""
         if not self._stopping:
-            self._enter_stopping()
+            with self._regardless():
+                self._enter_stopping()
         fault = f"a defect of the program ({problem}): look at the arm, restart the daemon"
-        self.record.presume(status="interrupted", error=problem, fault=fault, ended=utc_now())
-        return Ending("interrupted", problem, fault=fault)
+        ending = Ending("interrupted", problem, fault=fault)
+        with self._regardless():
+            ending = _with_fault(ending, await self._halt(clean=False))
+        with self._regardless():
+            ending = _with_fault(ending, await self._give_up(self._task))
+        with self._regardless():
+            await self.record.close()
+        self.record.presume(
+            status="interrupted", error=problem, fault=ending.fault, ended=utc_now()
+        )
+        return ending
 
     # -- Host
 
@@ -175,6 +198,7 @@ class ActiveRun:
 
     def _enter_stopping(self) -> None:
         self._stopping = True
+        self._gate.shut()
         self.question = None
         self._fire("stop")
 
@@ -202,6 +226,8 @@ class ActiveRun:
 
     async def _perform(self) -> Result:
         self.check()
+        if self.procedure.moves:
+            self._gate.admit()
         result = await self.procedure.run(self._run, self._cell, self._params)
         if not isinstance(result, Result):
             raise TypeError(f"{self.procedure.name} returned {type(result).__name__}, no Result")
@@ -226,18 +252,33 @@ class ActiveRun:
         await asyncio.wait({task}, timeout=self._limits.unwind_s)
         if not task.done():
             ending = _with_fault(ending, await self._halt(clean=False))
-            task.cancel()
-            await asyncio.wait({task}, timeout=self._limits.unwind_s)
-        if not task.done():
-            self.hung = task
-            return _with_fault(
-                ending, f"{self.procedure.name} does not end when it is told to: restart the daemon"
-            )
+            problem = await self._give_up(task)
+            if problem is not None:
+                return _with_fault(ending, problem)
         error = None if task.cancelled() else task.exception()
         if error is None:
             return ending
         log.error("while a run was being stopped", run=self.run_id, exc_info=error)
         return _with_fault(ending, ending_of(error).fault)
+
+    async def _give_up(self, task: asyncio.Task[Result] | None) -> str | None:
+        """Cancel the procedure once more. None when it ends, else what a person has to know."""
+        if task is None:
+            return None
+        task.cancel()
+        await asyncio.wait({task}, timeout=self._limits.unwind_s)
+        if task.done():
+            return None
+        self.hung = task
+        return f"{self.procedure.name} does not end when it is told to: restart the daemon"
+
+    @contextlib.contextmanager
+    def _regardless(self) -> Iterator[None]:
+        """What is raised inside is logged, and the next thing is done."""
+        try:
+            yield
+        except Exception:
+            log.exception("while a run was being forsaken", run=self.run_id)
 
     async def _halt(self, *, clean: bool) -> str | None:
         """Stop the arm. None when it stands still, else what a person has to know."""

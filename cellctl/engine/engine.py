@@ -8,7 +8,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import structlog
 
@@ -16,8 +16,10 @@ from cellctl.cell import Cell
 from cellctl.engine.active_run import ActiveRun, Limits
 from cellctl.engine.bulletin import Bulletin, Callback
 from cellctl.engine.ending import Ending
+from cellctl.engine.phases import PhaseEvent, transition
 from cellctl.engine.provenance import look_at, versions
-from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound
+from cellctl.errors import BadInput, Busy, CellctlError, DeviceFault, NotFound, printable
+from cellctl.gate import Gate
 from cellctl.messages import (
     Accepted,
     AckRequest,
@@ -35,43 +37,17 @@ from cellctl.messages import (
     Runs,
     State,
 )
-from cellctl.permission import Permission
 from cellctl.run import Procedure
 from cellctl.store.run_folder import RunFolder
 from cellctl.store.store import RunRecord, Store
 
-PhaseEvent = Literal["start", "ask", "answer", "withdraw", "stop", "end", "fault", "ack"]
-
-TRANSITIONS: Mapping[tuple[Phase, PhaseEvent], Phase] = {
-    ("idle", "start"): "running",
-    ("running", "ask"): "waiting",
-    ("waiting", "answer"): "running",
-    ("waiting", "withdraw"): "running",
-    ("running", "stop"): "stopping",
-    ("waiting", "stop"): "stopping",
-    ("stopping", "end"): "idle",
-    ("stopping", "fault"): "fault",
-    ("fault", "ack"): "idle",
-}
-
 log = structlog.get_logger(__name__)
-
-
-class IllegalTransition(Exception):
-    """The program is defective: an event came in a phase that does not know it."""
-
-
-def transition(phase: Phase, event: PhaseEvent) -> Phase:
-    """The next phase; IllegalTransition unless TRANSITIONS has it."""
-    try:
-        return TRANSITIONS[phase, event]
-    except KeyError:
-        raise IllegalTransition(f"{event!r} in phase {phase!r}") from None
 
 
 class Engine:
     """What the bus talks to. All of it is called on the event loop.
 
+    `gate` is what the robot of `cell` asks before it moves; the engine opens it for a run.
     `promotes` is asked whether the calibration of a run that is done becomes the active one at
     once; nobody but a person promotes, unless a policy is given here.
     """
@@ -81,17 +57,16 @@ class Engine:
         cell: Cell,
         procedures: Sequence[Procedure],
         store: Store,
-        permission: Permission,
+        gate: Gate,
         *,
-        boot: str | None = None,
         limits: Limits | None = None,
         promotes: Callable[[Ending], bool] = lambda _: False,
     ) -> None:
-        self.boot = boot or secrets.token_hex(8)
+        self.boot = secrets.token_hex(8)
         self._cell = cell
         self._procedures = {procedure.name: procedure for procedure in procedures}
         self._store = store
-        self._permission = permission
+        self._gate = gate
         self._limits = limits or Limits()
         self._promotes = promotes
         self._bulletin = Bulletin(self.boot)
@@ -107,7 +82,8 @@ class Engine:
 
     def state(self) -> State:
         """A snapshot."""
-        active, until = self._active, self._permission.until()
+        active, permission = self._active, self._gate.permission
+        until = permission.until()
         config = self._cell.config
         return State(
             cell=config.cell.id,
@@ -122,6 +98,7 @@ class Engine:
             active_calibration=self._store.calibrations.active,
             enabled=until is not None,
             enabled_until=None if until is None or math.isinf(until) else until,
+            enable_command=permission.command if until is None else None,
             simulated=config.simulation is not None,
             wall_time=time.time(),
         )
@@ -149,14 +126,15 @@ class Engine:
             ]
         )
 
-    async def runs(self) -> Runs:
-        """All runs, oldest first, without their results."""
-        return Runs(runs=[self._info(folder) for folder in self._store.folders()])
+    async def runs(self, limit: int | None = None) -> Runs:
+        """The newest `limit` runs (None: all), newest first, without their results."""
+        newest = self._store.folders()[::-1][:limit]
+        return Runs(runs=[self._info(folder) for folder in newest])
 
     async def run_info(self, run_id: str) -> RunInfo:
         """One run, with its result. NotFound names the newest runs."""
         info = self._info(self._store.folder(run_id))
-        return info.model_copy(update={"result": await self._store.result(run_id)})
+        return info.model_copy(update={"result": printable(await self._store.result(run_id))})
 
     async def calibration(self, calibration_id: str) -> CalibrationInfo:
         """A calibration by its id, or `active`. NotFound lists the known ones."""
@@ -258,19 +236,33 @@ class Engine:
             return Accepted(message=f"{request.calibration_id} is the active calibration")
 
     async def shutdown(self) -> None:
-        """Stop the arm, end the active run as interrupted, and start no other. Idempotent."""
+        """Stop the arm, end the active run as interrupted, and start no other. Idempotent.
+
+        The arm does not wait for a command that is under way, such as a promotion on a slow disk.
+        """
         self._closing = True
+        self._interrupt()
         async with self._commands:
-            if self._active is not None:
-                self._active.stop("interrupted", "the daemon was stopped")
+            self._interrupt()  # what that command has started
             if self._driver is not None:
                 await asyncio.shield(self._driver)
 
     # -- inside
 
+    def _interrupt(self) -> None:
+        if self._active is not None:
+            self._active.stop("interrupted", "the daemon was stopped")
+
     def _fire(self, event: PhaseEvent) -> None:
         self._phase = transition(self._phase, event)
-        self._bulletin.publish(self.state())
+        self._tell_state()
+
+    def _tell_state(self) -> None:
+        """Publish a snapshot. Runs begin and end whether or not there is one."""
+        try:
+            self._bulletin.publish(self.state())
+        except Exception:
+            log.exception("there is no snapshot of the state", phase=self._phase)
 
     async def _calibration(self, calibration_id: str | None) -> Mapping[str, Any] | None:
         if calibration_id is None:
@@ -290,6 +282,7 @@ class Engine:
             procedure=procedure,
             cell=self._cell,
             store=self._store,
+            gate=self._gate,
             bulletin=self._bulletin,
             fire=self._fire,
             limits=self._limits,
@@ -307,7 +300,7 @@ class Engine:
             ending = await active.supervise()
         except Exception as error:
             log.exception("the supervision of a run failed", run=active.run_id)
-            ending = active.forsake(repr(error))
+            ending = await active.forsake(repr(error))
         self._active, self._fault, self._hung = None, ending.fault, active.hung
         level = log.info if ending.status in ("done", "cancelled") else log.error
         level("run ended", run=active.run_id, status=ending.status, **ending.as_data())
@@ -358,7 +351,7 @@ class Engine:
         if self._fault is not None:
             raise DeviceFault(f"{self._fault}. When it is put right: `cellctl ack`")
         if procedure.moves:
-            self._permission.require()
+            self._gate.permission.require()
 
     async def _abandon(self, run_id: str, client: str) -> Accepted:
         status = self._store.folder(run_id).standing.status
@@ -388,4 +381,4 @@ class Engine:
         promote = self._store.calibrations.promote
         await self._store.in_order(promote, calibration_id, client, **options)
         self._bulletin.event("promoted", calibration_id=calibration_id, client=client)
-        self._bulletin.publish(self.state())
+        self._tell_state()

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from cellctl.errors import BadInput, NotFound
+from cellctl.explain import explain
 from cellctl.geometry import Array
 from cellctl.sim import requests as form
 from cellctl.sim.grid import Grid, describe
@@ -74,15 +75,10 @@ async def answer(door: str, session: Session, header: dict[str, Any], blob: byte
     try:
         request = kind.model_validate(header)
     except ValidationError as error:
-        raise BadInput(f"{verb}: {_explained(error)}") from None
+        raise BadInput(f"{verb}: {explain(error, kind, most=5)}") from None
     session.blob = blob
     session.cell.pace.now()
     return await handler(session, request)
-
-
-def _explained(error: ValidationError) -> str:
-    items = error.errors(include_url=False, include_input=False)
-    return "; ".join(f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in items[:5])
 
 
 async def hello(session: Session, _: form.Hello) -> Answer:

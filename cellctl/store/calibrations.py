@@ -42,11 +42,6 @@ class CalibrationStore:
         """The id of the promoted calibration."""
         return self._history[-1]["calibration_id"] if self._history else None
 
-    @property
-    def history(self) -> list[dict[str, Any]]:
-        """All promotions, newest last."""
-        return list(self._history)
-
     def ids(self) -> list[str]:
         return sorted(path.stem for path in self._directory.glob("*.json"))
 
@@ -112,11 +107,18 @@ class CalibrationStore:
     def _read_history(self) -> list[dict[str, Any]]:
         if not self._pointer.exists():
             return []
-        history = read_document(self._pointer, ACTIVE).get("history")
-        well_formed = isinstance(history, list) and all(
-            isinstance(item, dict) and isinstance(item.get("calibration_id"), str)
-            for item in history
-        )
-        if not well_formed:
+        document = read_document(self._pointer, ACTIVE)
+        history = document.get("history")
+        if not isinstance(history, list) or not all(map(_is_promotion, history)):
             raise BadInput(f"{self._pointer}: 'history' must list promotions with a calibration_id")
-        return list(history or [])
+        newest = history[-1]["calibration_id"] if history else None
+        if document.get("active") != newest:
+            raise BadInput(
+                f"{self._pointer}: 'active' is {document.get('active')!r}, but the newest "
+                f"promotion in 'history' is of {newest!r}: restore the file, or make both the same"
+            )
+        return list(history)
+
+
+def _is_promotion(item: Any) -> bool:
+    return isinstance(item, dict) and isinstance(item.get("calibration_id"), str)

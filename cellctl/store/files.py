@@ -76,9 +76,10 @@ def utc_now() -> str:
 
 
 def to_json(value: Any, where: str, indent: int | None = None) -> bytes:
-    """JSON in which floats survive exactly. BadInput names `where` when one is not finite."""
+    """JSON in which floats survive exactly, in ASCII, which holds every string there can be: a path
+    may have bytes that are not UTF-8. BadInput names `where` when a float is not finite."""
     try:
-        text = json.dumps(value, allow_nan=False, default=_plain, ensure_ascii=False, indent=indent)
+        text = json.dumps(value, allow_nan=False, default=_plain, indent=indent)
     except ValueError as error:
         raise BadInput(f"{where}: cannot be written as JSON: {error}") from None
     return text.encode()

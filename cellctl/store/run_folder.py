@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cellctl.errors import BadInput
+from cellctl.explain import explain
 from cellctl.messages import Progress, RunInfo
 from cellctl.store.files import Schema, read_document
 from cellctl.store.history import History, Standing, standing_of
@@ -90,9 +91,7 @@ def read_header(directory: Path) -> RunHeader:
     try:
         header = RunHeader.model_validate(read_document(path, RUN))
     except ValidationError as error:
-        item = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in item["loc"])
-        raise BadInput(f"{path}: {key}: {item['msg']}") from None
+        raise BadInput(f"{path}: {explain(error, RunHeader)}") from None
     return header
 
 

@@ -43,6 +43,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 UNBORN = ".new-"
+LOCK = "lock"
 
 log = structlog.get_logger(__name__)
 
@@ -129,7 +130,7 @@ class Store:
         self._runs = directory / "runs"
         with storage(directory):
             self._runs.mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(directory / "lock")
+        self._lock = _lock(directory / LOCK)
         try:
             with storage(directory):
                 sweep(directory)
@@ -217,21 +218,25 @@ class Store:
 
 
 def _create(folder: RunFolder) -> tuple[Journal, list[Entry]]:
-    """The run's directory appears whole, under its name, or not at all."""
-    header, directory = folder.header, folder.directory
-    unborn = directory.with_name(UNBORN + header.run_id)
-    with storage(directory):
-        try:
-            (unborn / "images").mkdir(parents=True)
-            write_document(unborn / "run.json", RUN, header.model_dump())
-            Journal.create(unborn / JOURNAL, header.run_id).close()
-            unborn.rename(directory)
-        except BaseException:
-            shutil.rmtree(unborn, ignore_errors=True)
-            raise
+    """The run's directory appears whole, under its name and started, or not at all."""
+    directory = folder.directory
+    unborn = directory.with_name(UNBORN + folder.header.run_id)
+    with storage(directory), contextlib.ExitStack() as undo:
+        undo.callback(shutil.rmtree, unborn, ignore_errors=True)
+        _write_unborn(unborn, folder.header)
+        unborn.rename(directory)
+        undo.callback(shutil.rmtree, directory, ignore_errors=True)
         sync_directory(directory.parent)
-    journal, entries = Journal.open(directory / JOURNAL)
-    return journal, [*entries, journal.append("started", {"boot": header.boot})]
+        opened = Journal.open(directory / JOURNAL)
+        undo.pop_all()
+    return opened
+
+
+def _write_unborn(unborn: Path, header: RunHeader) -> None:
+    (unborn / "images").mkdir(parents=True)
+    write_document(unborn / "run.json", RUN, header.model_dump())
+    with contextlib.closing(Journal.create(unborn / JOURNAL, header.run_id)) as journal:
+        journal.append("started", {"boot": header.boot})
 
 
 def _recovered(directory: Path) -> RunFolder:

@@ -115,10 +115,10 @@ def _broke(error: Exception) -> Broke:
     return Broke(summary, "".join(traceback.format_exception(error)))
 
 
-def _end_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent's thread ends."""
+def end_with(parent: int, by: signal.Signals = signal.SIGKILL) -> None:
+    """Have the kernel send `by` to this process when the thread that started it ends."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, by)
     if os.getppid() != parent:  # it ended before it could be watched
         os._exit(0)
 
@@ -144,7 +144,7 @@ def _listen(requests: BufferedReader, queue: SimpleQueue[Parts]) -> None:
 
 def main() -> None:
     parent, *modules = sys.argv[1:]
-    _end_with(int(parent))
+    end_with(int(parent))
     requests, replies = _claim_pipes()
     queue: SimpleQueue[Parts] = SimpleQueue()
     threading.Thread(target=_listen, args=(requests, queue), daemon=True).start()

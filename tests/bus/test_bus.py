@@ -14,12 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import structlog
 import zenoh
 
 from cellctl.bus import queries, server
 from cellctl.bus.client import Client
 from cellctl.bus.follow import Update
 from cellctl.bus.keys import Keys
+from cellctl.bus.preview import encode_preview
 from cellctl.bus.requests import MAX_PAYLOAD_BYTES
 from cellctl.bus.server import Server
 from cellctl.bus.session import open_connected, open_listening
@@ -323,12 +325,34 @@ def test_too_many_requests_at_once_are_refused(endpoint, tmp_path, monkeypatch):
             while daemon.server._slots._value and not late():
                 time.sleep(0.01)
         with pytest.raises(Busy, match="2 requests"):
+            client.ack()
+        monkeypatch.setattr(queries, "PAUSE_S", 0.01)
+        with pytest.raises(Busy, match="2 requests"):
             client.state()
         daemon.call(daemon.engine._commands.release)
         for future in stuck:
             with pytest.raises(NotFound):
                 future.result(5)
         assert client.state().phase == "idle"
+
+
+def test_a_daemon_that_is_busy_for_a_moment_ends_no_watch_and_no_read(client, daemon):
+    """All its slots are taken for longer than a poll, and than the first try of a question."""
+    slots = daemon.server._slots
+    run_id = client.run("count", {"n": 300, "pause_s": 0.01}).run_id
+    updates = client.watch(run_id)
+    next(updates)
+    taken = sum(slots.acquire(blocking=False) for _ in range(server.MAX_WAITING))
+    assert taken >= server.MAX_WAITING - 1
+    give_back = threading.Timer(0.3, slots.release, (taken,))
+    give_back.start()
+    assert client.state().active_run == run_id
+    give_back.join()
+    taken = sum(slots.acquire(blocking=False) for _ in range(server.MAX_WAITING))
+    give_back = threading.Timer(1.5, slots.release, (taken,))
+    give_back.start()
+    assert end_of(updates).status == "done"
+    give_back.join()
 
 
 def test_previews_are_small_and_only_made_for_watchers(daemon):
@@ -364,7 +388,7 @@ async def test_robot_snapshots_survive_a_robot_that_cannot_be_read(endpoint, tmp
         nonlocal reads
         reads += 1
         if reads < 3:
-            raise DeviceFault("the link is down")
+            raise DeviceFault("the link is down") if reads == 1 else KeyError("joints")
         return RobotSnapshot(
             t=1.0, joints=[0.0] * 6, position=[0.0] * 3, rvec=[0.0] * 3, standstill_s=1.0
         )
@@ -380,6 +404,45 @@ async def test_robot_snapshots_survive_a_robot_that_cannot_be_read(endpoint, tmp
             with session.declare_subscriber(KEYS.robot, hear):
                 await asyncio.wait_for(came.wait(), 5)
     assert reads >= 3
+
+
+def test_publishing_goes_on_after_any_error_and_says_so_once(daemon, client, monkeypatch):
+    """Two rounds of state, of the robot and of pictures fail; the third is told."""
+    monkeypatch.setattr("cellctl.bus.publications.STATE_S", 0.02)
+    publications, failures = daemon.server._publications, dict.fromkeys(("state", "encode"), 2)
+
+    def failing(name, function):
+        def call(*arguments):
+            if failures[name] > 0:
+                failures[name] -= 1
+                raise OSError(5, "Input/output error")
+            return function(*arguments)
+
+        return call
+
+    state = failing("state", daemon.engine.state)
+    encode = failing("encode", encode_preview)
+    monkeypatch.setattr("cellctl.bus.publications.encode_preview", encode)
+    heard: set[str] = set()
+    image = np.zeros((48, 64), np.uint8)
+    with (
+        structlog.testing.capture_logs() as logs,
+        open_connected(daemon.endpoint) as session,
+        session.declare_subscriber(KEYS.frame("camera"), lambda _: heard.add("picture")),
+        session.declare_subscriber(KEYS.state, lambda _: heard.add("state")),
+        deadline(5) as late,
+    ):
+        monkeypatch.setattr(daemon.engine, "state", state)
+        while failures["state"] and not late():
+            time.sleep(0.01)
+        heard.discard("state")
+        while heard != {"picture", "state"} and not late():
+            daemon.call(lambda: daemon.server.publish_frame("camera", image))
+            time.sleep(0.01)
+    living = {task.get_name() for task in publications._tasks if not task.done()}
+    assert living == {"bus state", "bus previews"}, "and there is no robot to be told of"
+    failed = [line["what"] for line in logs if line["event"] == "publishing fails"]
+    assert sorted(failed) == ["previews", "state"]
 
 
 def test_a_trigger_reads_as_documented(client):

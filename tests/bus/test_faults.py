@@ -17,6 +17,7 @@ import pytest
 
 from cellctl.bus.client import Client
 from cellctl.bus.follow import Link
+from cellctl.errors import Unreachable
 from cellctl.messages import Event, Progress, RunInfo, State
 from tests.bus.toy import Daemon, deadline, store_large_calibration
 
@@ -31,6 +32,14 @@ with open_connected(sys.argv[1]) as session:
             session.get("cell/toy/@v1/get/calibration/large", lambda reply: None, timeout=60)
         print("ready", flush=True)
         sys.stdin.read()
+"""
+
+
+COMMAND = """
+import sys
+from cellctl.cli.app import main
+print("ready", flush=True)
+sys.exit(main(sys.argv[2:]))
 """
 
 
@@ -150,6 +159,25 @@ def test_a_watcher_outlives_the_daemon(endpoint, tmp_path):
     assert {(event.boot, event.run_id) for event in events} == {(other.boot, other.run_id)}
     assert [event.kind for event in events] == ["started", "step", "sample", "ended"]
     assert boot != other.boot
+
+
+def test_who_waits_gives_up_when_told_to(endpoint, tmp_path):
+    """Also the commands: exit code 5, as of a daemon that never was."""
+    with (
+        program("-m", "tests.bus.toy", endpoint, str(tmp_path)) as daemon,
+        Client(endpoint) as client,
+    ):
+        run_id = client.run("count", {"n": 2000, "pause_s": 0.01}).run_id
+        updates = client.watch(run_id, give_up_s=1.0)
+        command = ["cellctl", "watch", run_id, "--give-up", "1", "--connect", endpoint]
+        with program("-c", COMMAND, *command) as watching:
+            assert watching.stdout
+            assert watching.stdout.readline(), "it watches"
+            next(updates)
+            daemon.kill()
+            with pytest.raises(Unreachable, match="of toy has not answered for"):
+                list(updates)
+            assert watching.wait(20) == 5
 
 
 def test_who_waits_for_a_run_learns_that_the_daemon_was_killed(endpoint, tmp_path):

@@ -74,7 +74,7 @@ def test_any_request_gets_an_answer_that_can_be_sent(daemon, path, parameters, p
         ("get/run/*", b"", "bad_request", "wildcards"),
         ("**", b"", "bad_request", "wildcards"),
         ("get/run/..", b"", "bad_request", "is not a name"),
-        ("cmd/run/count", b"", "bad_request", "request_id: Field required"),
+        ("cmd/run/count", b"", "bad_request", "missing key 'request_id'"),
         ("cmd/run/count", b"{", "bad_request", "Invalid JSON"),
         ("cmd/run/count", {"request_id": "1234567"}, "bad_request", "at least 8 characters"),
         (

@@ -3,15 +3,9 @@ from __future__ import annotations
 import pytest
 import zenoh
 
-from cellctl import config
-from cellctl.bus import session
 from cellctl.bus.keys import Keys, check_name, parse_live
 from cellctl.bus.session import check_endpoint, open_connected, open_listening, plain
 from cellctl.errors import BadInput, Unreachable
-
-
-def test_daemon_and_command_line_meet_at_the_same_endpoint():
-    assert session.DEFAULT_ENDPOINT == config.DEFAULT_ENDPOINT
 
 
 @pytest.mark.parametrize(

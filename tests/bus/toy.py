@@ -20,11 +20,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.bus.server import Server
 from cellctl.cell import Cell
-from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
 from cellctl.drivers import base
 from cellctl.engine import Engine
 from cellctl.errors import CellctlError, DeviceFault
+from cellctl.gate import Gate
 from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
@@ -119,9 +119,9 @@ async def toy_engine(directory: Path) -> AsyncIterator[Engine]:
     config = parse_config(document, "toy")
     still = Still()
     guard = guard_of(config)
-    cell = Cell(config, guard, still, still, still, MonotonicClock(), still)
+    cell = Cell(config, guard, still, still, still, still)
     store = await Store.open(directory)
-    engine = Engine(cell, PROCEDURES, store, Permission(directory))
+    engine = Engine(cell, PROCEDURES, store, Gate(Permission(directory)))
     try:
         yield engine
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import pytest
@@ -69,11 +70,18 @@ def test_a_question_is_shown_and_answered(cellctl):
     wait_for(cellctl, "waiting")
     status = cellctl("status").out
     assert "is the board on?" in status
-    assert "cellctl ack --answer yes" in status
-    wrong = cellctl("ack", "--answer", "perhaps")
+    question = cellctl("status", "--json").json["question"]["id"]
+    number = ("--question", str(question))
+    assert f"cellctl ack --answer yes --question {question}" in status
+    wrong = cellctl("ack", "--answer", "perhaps", *number)
     assert (wrong.code, wrong.out) == (2, "")
     assert "choose one of: yes, no" in wrong.err
-    assert cellctl("ack", "--answer", "yes").code == 0
+    unnamed = cellctl("ack", "--answer", "yes")
+    assert unnamed.code == 2
+    assert f"cellctl ack --answer yes --question {question}" in unnamed.err
+    late = cellctl("ack", "--answer", "yes", "--question", str(question - 1))
+    assert (late.code, "no longer asked" in late.err) == (2, True)
+    assert cellctl("ack", "--answer", "yes", *number).code == 0
     assert cellctl("watch", run_id).code == 0
     assert cellctl("ack").code == 2
 
@@ -81,8 +89,10 @@ def test_a_question_is_shown_and_answered(cellctl):
 def test_a_stepped_run_asks_at_every_checkpoint(cellctl):
     run_id = started(cellctl, "count", "--step", "--speed", "50")
     wait_for(cellctl, "waiting")
-    assert "cellctl ack --answer 'go on without asking'" in cellctl("status").out
-    assert cellctl("ack", "--answer", "cancel").code == 0
+    question = cellctl("status", "--json").json["question"]["id"]
+    command = f"cellctl ack --answer 'go on without asking' --question {question}"
+    assert command in cellctl("status").out
+    assert cellctl("ack", "--answer", "cancel", "--question", str(question)).code == 0
     said = cellctl("watch", run_id)
     assert said.code == 1
     assert "CANCELLED" in said.out
@@ -97,6 +107,15 @@ def test_cancel_and_busy(cellctl):
     assert run_id in cellctl("cancel").out
     assert cellctl("watch", run_id).out.splitlines()[-2].startswith("CANCELLED")
     assert cellctl("cancel").code == 6
+
+
+def test_every_line_of_a_watch_as_json_says_its_type(cellctl):
+    run_id = started(cellctl, "count", "--param", "n=2")
+    said = cellctl("watch", run_id, "--json")
+    lines = [json.loads(line) for line in said.out.splitlines()]
+    assert {"Event", "RunInfo"} <= {line["type"] for line in lines}
+    assert (lines[-1]["type"], lines[-1]["run_id"]) == ("RunInfo", run_id)
+    assert said.code == 0
 
 
 def test_an_interrupted_run_is_resumed_or_given_up(cellctl):
@@ -135,8 +154,10 @@ def test_a_calibration_is_shown_and_promoted(cellctl):
 def test_motion_needs_permission_given_on_this_machine(cellctl, tmp_path, monkeypatch):
     refused = cellctl("run", "move")
     assert refused.code == 4
-    assert "cellctl enable --for 8h" in refused.err
-    assert "cellctl enable" in cellctl("status").out
+    command = f"CELLCTL_DATA={tmp_path} cellctl enable --for 8h"
+    assert refused.err.rstrip().endswith(command)
+    assert command in cellctl("status").out.replace("\n", "")
+    assert cellctl("run", "move", "--json").json["error"]["details"] == {"command": command}
     monkeypatch.setenv("CELLCTL_DATA", str(tmp_path))
     assert cellctl("enable", "--for", "10m").code == 0
     assert permission.Permission(tmp_path).until() == pytest.approx(time.time() + 600, abs=30)
@@ -157,7 +178,7 @@ def test_procedures_and_runs_are_listed(cellctl):
     ("arguments", "code", "text"),
     [
         (["run", "nope"], 6, "there are: count, ask, fault, move"),
-        (["run", "count", "--param", "m=1"], 2, "no parameter 'm'"),
+        (["run", "count", "--param", "m=1"], 2, "unknown parameter 'm'"),
         (["run", "count", "--param", "n"], 2, "expected name=value"),
         (["run", "count", "--param", "n=1", "--param", "n=2"], 2, "given twice"),
         (["run", "count", "--speed", "0"], 2, "speed"),

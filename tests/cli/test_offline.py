@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cellctl.bus.session import DEFAULT_ENDPOINT
 from cellctl.cli.boards import OPTIONS
+from cellctl.local import DEFAULT_ENDPOINT
+from cellctl.permission import FILE
 
 ROOT = Path(__file__).parents[2]
 
@@ -74,6 +75,21 @@ def test_enable_refuses_what_is_no_duration(offline, tmp_path, monkeypatch, dura
     monkeypatch.setenv("CELLCTL_DATA", str(tmp_path))
     assert offline("enable", f"--for={duration}").code == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_enable_writes_where_a_daemon_reads_it(offline, tmp_path, monkeypatch):
+    """The default directory counts only when some daemon keeps its data there."""
+    monkeypatch.delenv("CELLCTL_DATA", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    data = tmp_path / ".local" / "share" / "cellctl"
+    said = offline("enable")
+    assert said.code == 2
+    assert f"no daemon keeps its data in {data}" in said.err
+    assert not data.exists()
+    data.mkdir(parents=True)
+    (data / "lock").touch()
+    assert offline("enable").code == 0
+    assert (data / FILE).exists()
 
 
 COMMANDS = (

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 
 import pytest
 import structlog
 
 from cellctl.engine.bulletin import KEPT, Bulletin
-from cellctl.engine.engine import TRANSITIONS, IllegalTransition, transition
+from cellctl.engine.phases import TRANSITIONS, IllegalTransition, transition
 from cellctl.errors import BadInput, Busy, DeviceFault, NotEnabled, NotFound
-from cellctl.messages import Event, Phase, Progress, PromoteRequest, RunRequest, State
+from cellctl.messages import AckRequest, Event, Phase, Progress, PromoteRequest, RunRequest, State
 from cellctl.permission import enable
 from tests import cells
 from tests.core.toy import ToyRobot, bench
@@ -160,11 +161,17 @@ async def test_the_same_run_elsewhere_takes_the_same_samples(toy):
     ("procedure", "params", "error", "words"),
     [
         ("surveys", {}, NotFound, "no procedure 'surveys'; there are: survey, chained"),
-        ("survey", {"view": 3}, BadInput, "survey: no parameter 'view'; did you mean 'views'"),
-        ("survey", {"colour": 3}, BadInput, "no parameter 'colour'; it has: views, scale"),
+        ("survey", {"view": 3}, BadInput, "survey: unknown parameter 'view'; did you mean 'views'"),
+        ("survey", {"colour": 3}, BadInput, "unknown parameter 'colour'; known here: scale, views"),
         ("survey", {"views": "many"}, BadInput, "survey: views: Input should be a valid integer"),
         ("survey", {"views": 0, "scale": []}, BadInput, "views: .*greater than or equal.*; scale"),
-        ("troubled", {}, BadInput, "parameter 'kind' is missing"),
+        ("troubled", {}, BadInput, "missing parameter 'kind'"),
+        (
+            "nested",
+            {"survey": {"veiws": 3}},
+            BadInput,
+            "nested: unknown parameter 'survey.veiws'; did you mean 'views'",
+        ),
     ],
 )
 async def test_bad_requests_are_named(toy, procedure, params, error, words):
@@ -496,6 +503,17 @@ async def test_a_late_answer_is_not_taken_for_another_questions(toy):
         await toy.ack("yes", first.id)
 
 
+async def test_where_there_is_a_choice_the_question_is_named(toy):
+    run_id = await toy.start("asking")
+    question = (await toy.phase("waiting")).question
+    assert question is not None
+    command = f"cellctl ack --answer red --question {question.id}"
+    with pytest.raises(BadInput, match=f"say which question is answered.*{command}"):
+        await toy.engine.ack(AckRequest(answer="red"))
+    await toy.cancel()
+    assert (await toy.ended(run_id)).status == "cancelled"
+
+
 async def test_cancel_while_waiting(toy):
     run_id = await toy.start("asking")
     await toy.phase("waiting")
@@ -688,14 +706,69 @@ async def test_procedures_show_their_parameters(toy):
     assert not shown["look-up"].moves
 
 
+async def test_a_run_ends_though_there_is_no_snapshot_to_tell(toy, monkeypatch):
+    """As when the disk that holds the permission fails in the middle of a run."""
+
+    def broken():
+        raise OSError(5, "Input/output error")
+
+    run_id = await toy.start("survey", views=1000)
+    await toy.until(lambda: toy.robot.moving)
+    monkeypatch.setattr(toy.engine, "state", broken)
+    with structlog.testing.capture_logs() as logs:
+        await toy.cancel()
+        await toy.until(lambda: "ended" in toy.events())
+    monkeypatch.undo()
+    assert {line["event"] for line in logs if line["log_level"] == "error"} == {
+        "there is no snapshot of the state"
+    }
+    assert (await toy.engine.run_info(run_id)).status == "cancelled"
+    assert toy.engine.state().phase == "idle"
+    assert toy.robot.stops == [True]
+
+
+STRANGE = os.fsdecode(b"caf\xe9")
+"""The name of a file in Latin-1, as Python has it where names are UTF-8."""
+
+
+async def test_names_that_are_not_utf8_are_recorded_and_told(tmp_path):
+    async with bench(tmp_path / STRANGE) as toy:
+        info = await toy.ended(await toy.start("survey", views=1))
+        assert info.status == "done"
+        assert json.loads(info.model_dump_json())["directory"].endswith(f"runs/{info.run_id}")
+        shown = str(toy.directory).replace("\udce9", r"\udce9")
+        assert info.directory == f"{shown}/runs/{info.run_id}"
+
+
+@pytest.mark.parametrize("kind", ["strange fault", "strange defect"])
+async def test_an_error_about_such_a_name_ends_a_run_as_any_other(toy, kind):
+    with structlog.testing.capture_logs() as logs:
+        info = await toy.ended(await toy.start("troubled", kind=kind))
+    assert "the supervision of a run failed" not in [line["event"] for line in logs]
+    assert r"caf\udce9" in str(info.error)
+    assert toy.journal(info.run_id)[-1].kind == info.status
+    for message in (info, toy.engine.events()):
+        assert r"caf\\udce9" in message.model_dump_json()
+    assert toy.engine.state().model_dump_json()
+
+
 # -- the table
+
+
+LEGAL = {
+    "idle": {"start": "running"},
+    "running": {"ask": "waiting", "stop": "stopping"},
+    "waiting": {"answer": "running", "withdraw": "running", "stop": "stopping"},
+    "stopping": {"end": "idle", "fault": "fault"},
+    "fault": {"ack": "idle"},
+}
 
 
 @pytest.mark.parametrize("phase", PHASES)
 @pytest.mark.parametrize("event", EVENTS)
 def test_the_table_is_all_there_is(phase, event):
-    if (phase, event) in TRANSITIONS:
-        assert transition(phase, event) in PHASES
+    if event in LEGAL[phase]:
+        assert transition(phase, event) == LEGAL[phase][event]
     else:
         with pytest.raises(IllegalTransition, match=f"'{event}' in phase '{phase}'"):
             transition(phase, event)

@@ -13,7 +13,7 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cellctl.engine.engine import TRANSITIONS
+from cellctl.engine.phases import TRANSITIONS
 from cellctl.errors import CellctlError
 from cellctl.messages import State
 from cellctl.store.history import ENDED, standing_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
-import time
 
 import pytest
 from hypothesis import given
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from cellctl.errors import BadInput, NotEnabled
 from cellctl.permission import FILE, LONGEST_S, Permission, enable, parse_duration
+from cellctl.store.files import read_document
 
 NOW = 1_800_000_000.0
 
@@ -20,8 +21,11 @@ NOW = 1_800_000_000.0
 def test_without_a_grant_the_command_to_type_is_said(tmp_path):
     permission = Permission(tmp_path)
     assert permission.until() is None
-    with pytest.raises(NotEnabled, match=r"motion is not enabled.*type: cellctl enable --for 8h"):
+    with pytest.raises(NotEnabled, match="motion is not enabled") as caught:
         permission.require()
+    command = f"CELLCTL_DATA={tmp_path} cellctl enable --for 8h"
+    assert caught.value.message.endswith(f"type: {command}")
+    assert caught.value.details == {"command": command}
 
 
 def test_a_grant_holds_until_it_ends(tmp_path):
@@ -64,6 +68,7 @@ def test_a_clock_that_was_set_back_does_not_prolong_it(tmp_path):
         '{"schema": "cellctl-permission/2", "since": 0, "until": 1, "by": "me"}',
         '{"schema": "cellctl-permission/1", "since": "x", "until": 1, "by": "me"}',
         '{"schema": "cellctl-permission/1", "since": 0, "until": Infinity, "by": "me"}',
+        '{"schema": "cellctl-permission/1", "since": true, "until": "1800000001", "by": "me"}',
         '{"schema": "cellctl-permission/1", "since": NaN, "until": 9e99, "by": "me"}',
         '{"schema": "cellctl-permission/1", "since": 0, "until": 9e99, "by": "me"}',
         '{"schema": "cellctl-permission/1", "since": [], "until": {}, "by": "me"}',
@@ -77,11 +82,79 @@ def test_a_malformed_grant_is_none(tmp_path, content):
         Permission(tmp_path).require(NOW)
 
 
-@given(st.binary(max_size=200))
-def test_no_bytes_enable_a_cell(tmp_path_factory, content):
+VALID = {"schema": "cellctl-permission/1", "since": NOW - 10, "until": NOW + 3600, "by": "me"}
+NASTY = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.floats(NOW - 2 * LONGEST_S, NOW + 2 * LONGEST_S),
+    st.text(max_size=5),
+    st.lists(st.floats(), max_size=2),
+)
+
+
+def permits(document) -> bool:
+    """What the documentation says of a grant, in other words than the program's."""
+    since, until = document.get("since"), document.get("until")
+    if document.get("schema") != "cellctl-permission/1" or "by" not in document:
+        return False
+    if not all(type(moment) in (int, float) for moment in (since, until)):
+        return False
+    return since - 60 <= NOW < until <= since + LONGEST_S
+
+
+@given(st.sampled_from(sorted(VALID)), st.one_of(st.just("missing"), NASTY))
+def test_a_grant_counts_only_as_long_as_every_field_of_it_does(tmp_path_factory, field, value):
     directory = tmp_path_factory.getbasetemp()
-    (directory / FILE).write_bytes(content)
-    assert Permission(directory).until(time.time()) is None
+    document = {**VALID, field: value}
+    if value == "missing":
+        del document[field]
+    (directory / FILE).write_text(json.dumps(document))
+    until = Permission(directory).until(NOW)
+    assert until == (float(document["until"]) if permits(document) else None)
+
+
+@given(st.integers(1, len(json.dumps(VALID)) - 1))
+def test_a_grant_that_was_cut_short_is_none(tmp_path_factory, length):
+    directory = tmp_path_factory.getbasetemp()
+    (directory / FILE).write_text(json.dumps(VALID)[:length])
+    assert Permission(directory).until(NOW) is None
+
+
+def test_a_file_that_cannot_be_looked_at_is_no_permission_and_says_why(tmp_path):
+    """As with a disk that reports errors, or a file system that has gone."""
+    permission = Permission(tmp_path / ("d" * 300))
+    assert permission.until() is None
+    with pytest.raises(NotEnabled, match="cannot be read: File name too long"):
+        permission.require()
+
+
+def test_a_grant_is_read_once_and_again_when_it_was_replaced(tmp_path, monkeypatch):
+    reads = []
+
+    def counted(path, schema):
+        reads.append(path)
+        return read_document(path, schema)
+
+    monkeypatch.setattr("cellctl.permission.read_document", counted)
+    enable(tmp_path, 3600, now=NOW)
+    permission = Permission(tmp_path)
+    assert {permission.until(NOW) for _ in range(5)} == {NOW + 3600}
+    assert len(reads) == 1
+    enable(tmp_path, 1800, now=NOW)
+    assert {permission.until(NOW) for _ in range(5)} == {NOW + 1800}
+    assert len(reads) == 2
+    (tmp_path / FILE).unlink()
+    assert permission.until(NOW) is None
+
+
+def test_a_user_without_a_name_can_enable(tmp_path, monkeypatch):
+    def nameless():
+        raise KeyError("getpwuid(): uid not found: 1234")
+
+    monkeypatch.setattr("getpass.getuser", nameless)
+    assert enable(tmp_path, 60).by == f"uid{os.getuid()}"
 
 
 @pytest.mark.parametrize(

@@ -159,6 +159,26 @@ async def test_an_unfinished_creation_leaves_nothing(store):
     await store.close()
 
 
+@pytest.mark.parametrize("step", ["Journal.append", "sync_directory"])
+async def test_a_creation_that_the_disk_refuses_leaves_nothing(store, monkeypatch, step):
+    """The line `started` is one that may be refused; so may be making the name durable."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"cellctl.store.store.{step}", full)
+    with pytest.raises(StorageFault, match="disk is full"):
+        await store.create(header())
+    monkeypatch.undo()
+    assert list((store.directory / "runs").iterdir()) == []
+    assert store.requested("request-run-1") is None
+    other = await store.create(header("run-2"))
+    await other.close()
+    reopened = await again(store)
+    assert [folder.header.run_id for folder in reopened.folders()] == ["run-2"]
+    await reopened.close()
+
+
 async def test_a_damaged_run_is_listed_and_keeps_no_other_from_being_opened(store):
     for run_id in ("r1", "r2", "r3"):
         await (await store.create(header(run_id))).close()
@@ -285,12 +305,19 @@ def test_promotion_has_a_history(calibrations, tmp_path):
         calibrations.add(name, calibration())
         calibrations.promote(name, "me", despite_failed_verdict=False)
     calibrations.promote("c2", "me", despite_failed_verdict=False)
-    assert [p["calibration_id"] for p in CalibrationStore(tmp_path).history] == ["c1", "c2"]
+    assert [(p["calibration_id"], p["verdict"]) for p in promotions(tmp_path)] == [
+        ("c1", "pass"),
+        ("c2", "pass"),
+    ]
     assert CalibrationStore(tmp_path).info("active").calibration_id == "c2"
     assert not calibrations.info("c1").active
 
 
-def test_what_failed_is_promoted_only_when_that_is_said(calibrations):
+def promotions(directory):
+    return json.loads((directory / "active.json").read_text())["history"]
+
+
+def test_what_failed_is_promoted_only_when_that_is_said(calibrations, tmp_path):
     calibrations.add("good", calibration())
     calibrations.add("bad", calibration("fail"))
     calibrations.promote("good", "me", despite_failed_verdict=False)
@@ -299,7 +326,7 @@ def test_what_failed_is_promoted_only_when_that_is_said(calibrations):
     assert calibrations.active == "good"
     calibrations.promote("bad", "me", despite_failed_verdict=True)
     assert calibrations.active == "bad"
-    assert calibrations.history[-1]["verdict"] == "fail"
+    assert [p["verdict"] for p in promotions(tmp_path)] == ["pass", "fail"]
 
 
 def test_what_is_not_there_is_not_found(calibrations):
@@ -321,8 +348,16 @@ def test_what_is_not_there_is_not_found(calibrations):
         ('{"schema": "cellctl-active/1", "history": {"c1": 1}}', "'history' must list"),
         ('{"schema": "cellctl-active/1", "history": [{"id": "c1"}]}', "'history' must list"),
         (
-            '{"schema": "cellctl-active/1", "history": [{"calibration_id": "gone"}]}',
-            "names gone, but .*gone.json is not there: restore that file",
+            '{"schema": "cellctl-active/1", "active": "c1", "history": []}',
+            "'active' is 'c1', but the newest promotion in 'history' is of None",
+        ),
+        (
+            '{"schema": "cellctl-active/1", "active": "c1", "history": [{"calibration_id": "c2"}]}',
+            "'active' is 'c1', but the newest promotion in 'history' is of 'c2'",
+        ),
+        (
+            '{"schema": "cellctl-active/1", "active": "g", "history": [{"calibration_id": "g"}]}',
+            "names g, but .*g.json is not there: restore that file",
         ),
     ],
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import os
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
+from cellctl.arms import arm
 from cellctl.cell import Cell, Solver
-from cellctl.clock import MonotonicClock
 from cellctl.config import parse_config
 from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
 from cellctl.drivers.base import Path as Joints
@@ -27,6 +28,7 @@ from cellctl.engine import Engine
 from cellctl.engine.active_run import Limits
 from cellctl.engine.bulletin import Published
 from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotEnabled
+from cellctl.gate import Gate
 from cellctl.geometry import Transform
 from cellctl.messages import (
     Accepted,
@@ -49,11 +51,15 @@ from tests.core import functions
 
 SPEED_RAD_S = 20.0
 PERIOD_S = 0.005
+ARM = arm("ur5")
 LIMITS = Limits(stop_s=0.5, unwind_s=0.3, identity_s=0.3)
 
 
 class ToyRobot:
+    """Asks `allowed` before it moves, as the guarded robot does."""
+
     def __init__(self) -> None:
+        self.allowed: Callable[[], None] = lambda: None
         self.joints = np.zeros(6)
         self.moving = False
         self.moves = 0
@@ -69,7 +75,7 @@ class ToyRobot:
         return Identity("toy", "bench arm", self.serial)
 
     async def read(self) -> RobotState:
-        pose = Transform.identity("world", "flange")
+        pose = Transform("world", "flange", ARM.forward(self.joints))
         still = 0.0 if self.moving else 1.0
         return RobotState(time.monotonic(), self.joints.copy(), np.zeros(6), pose, still)
 
@@ -81,6 +87,7 @@ class ToyRobot:
             raise MotionRefused("a joint would leave its range")
 
     async def move(self, target: Target, *, timeout_s: float) -> RobotState:
+        self.allowed()
         await self.check(target.path)
         self.moving = True
         self.moves += 1
@@ -127,7 +134,11 @@ class ToyProjector:
         return time.monotonic()
 
 
-class ToyParams(BaseModel):
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ToyParams(Params):
     views: int = Field(default=5, ge=1, le=1000)
     scale: float = 1.0
 
@@ -168,6 +179,14 @@ async def chained(run: Run, cell: Cell, params: ToyParams) -> Result:
     return Result("pass", (), {"lines": lines})
 
 
+class NestedParams(Params):
+    survey: ToyParams = ToyParams()
+
+
+async def nested(run: Run, cell: Cell, params: NestedParams) -> Result:
+    return await survey(run.scope("survey"), cell, params.survey)
+
+
 async def asking(run: Run, cell: Cell, params: ToyParams) -> Result:
     colour = await run.ask("Which colour?", ["red", "blue"])
     sure = await run.ask(f"Really {colour}?", ["yes", "no"])
@@ -182,7 +201,7 @@ async def impatient(run: Run, cell: Cell, params: ToyParams) -> Result:
     return await survey(run, cell, params)
 
 
-class Trouble(BaseModel):
+class Trouble(Params):
     kind: str
     seconds: float = 60.0
 
@@ -204,6 +223,15 @@ async def _fault(run: Run, params: Trouble) -> None:
 
 async def _defect(run: Run, params: Trouble) -> None:
     int("seven")
+
+
+async def _strange_fault(run: Run, params: Trouble) -> None:
+    name = os.fsdecode(b"/dev/caf\xe9")
+    raise DeviceFault(f"cannot open {name}", path=name)
+
+
+async def _strange_defect(run: Run, params: Trouble) -> None:
+    Path(os.fsdecode(b"/nowhere/caf\xe9")).read_bytes()  # noqa: ASYNC240 - it is not there
 
 
 async def _child_defect(run: Run, params: Trouble) -> None:
@@ -276,6 +304,8 @@ TROUBLES = {
     "bad input": _bad_input,
     "fault": _fault,
     "defect": _defect,
+    "strange fault": _strange_fault,
+    "strange defect": _strange_defect,
     "child defect": _child_defect,
     "child death": _child_death,
     "group": _group,
@@ -303,6 +333,7 @@ async def look_up(run: Run, cell: Cell, params: ToyParams) -> Result:
 PROCEDURES = (
     Procedure("survey", "Move, look, solve", ToyParams, moves=True, run=survey),
     Procedure("chained", "Two surveys", ToyParams, moves=True, run=chained),
+    Procedure("nested", "A survey in a scope", NestedParams, moves=True, run=nested),
     Procedure("asking", "Asks twice", ToyParams, moves=False, run=asking),
     Procedure("impatient", "Asks, with a deadline", ToyParams, moves=True, run=impatient),
     Procedure("troubled", "Ends badly", Trouble, moves=True, run=troubled),
@@ -334,6 +365,10 @@ class Bench:
         return await self.engine.cancel(CancelRequest(run_id=run_id, client="test"))
 
     async def ack(self, answer: str = "ok", question: int | None = None) -> Accepted:
+        """Acknowledge a fault, or answer the question with this id (None: what is asked now)."""
+        asked = self.engine.state().question
+        if question is None and asked is not None:
+            question = asked.id
         return await self.engine.ack(AckRequest(answer=answer, question=question, client="test"))
 
     async def phase(self, *phases: str) -> State:
@@ -377,9 +412,10 @@ async def bench(
         store = await Store.open(directory)
         stack.push_async_callback(store.close)
         devices = (robot, ToyCamera(), ToyProjector())
-        cell = Cell(config, guard_of(config), *devices, MonotonicClock(), solver)
-        permission = Permission(directory, always=enabled)
-        engine = Engine(cell, procedures, store, permission, limits=limits, **options)
+        cell = Cell(config, guard_of(config), *devices, solver)
+        gate = Gate(Permission(directory, always=enabled))
+        robot.allowed = gate.require
+        engine = Engine(cell, procedures, store, gate, limits=limits, **options)
         stack.push_async_callback(engine.shutdown)
         made = Bench(directory, store, engine, robot, solver)
         engine.subscribe(made.seen.append)

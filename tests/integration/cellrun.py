@@ -14,8 +14,12 @@ from typing import Any
 from cellctl.bus.client import Client
 from cellctl.config import load_config
 from cellctl.demo import start_daemon, write_config
+from cellctl.drivers.base import RobotState
 from cellctl.messages import RunInfo
-from cellctl.sim.launch import stop_world
+from cellctl.sim.drivers import SimRobot
+from cellctl.sim.endpoint import read_endpoint
+from cellctl.sim.launch import endpoint_file, stop_world
+from cellctl.sim.link import SimClock
 
 QUICK = {
     "intrinsic": {"views": 8},
@@ -72,6 +76,15 @@ class CellRun:
                     return info
                 time.sleep(0.1)
         raise AssertionError(f"run {run_id} did not end:\n{self.log()}")
+
+    async def arm(self) -> RobotState:
+        """The arm in the world, which outlives the daemon."""
+        endpoint = read_endpoint(endpoint_file(self.folder))
+        robot = SimRobot(endpoint, load_config(self.config), SimClock(endpoint.time))
+        try:
+            return await robot.read()
+        finally:
+            await robot.close()
 
     def journal(self, run_id: str) -> list[str]:
         """The complete lines of a run's journal."""

@@ -14,9 +14,11 @@ import random
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from cellctl.errors import CellctlError
 from tests.integration.cellrun import QUICK, CellRun, cell_run
 
 
@@ -32,15 +34,16 @@ def reference(folder: Path) -> tuple[dict[str, Any], float]:
         return cell.result(run_id), time.monotonic() - started
 
 
-def killed(
-    cell: CellRun, kills: int, span_s: float, chance: random.Random
-) -> tuple[str, list[str]]:
-    """One run, killed `kills` times; its id and what went wrong."""
+def killed(cell: CellRun, instants: Sequence[float]) -> tuple[str, int, list[str]]:
+    """One run, killed at these seconds of its run time, which rise; its id, how many of the kills
+    interrupted it, and what went wrong."""
     with cell.client() as client:
         run_id = client.run("full", QUICK).run_id
+    interrupted, ran_s = 0, 0.0
     wrong: list[str] = []
-    for _ in range(kills):
-        time.sleep(chance.uniform(0.0, span_s))
+    for instant in instants:
+        time.sleep(instant - ran_s)
+        ran_s = instant
         cell.kill()
         before = cell.journal(run_id)
         cell.start()
@@ -48,8 +51,9 @@ def killed(
         with cell.client() as client:
             if client.run_info(run_id).status == "done":
                 break
+            interrupted += 1
             client.resume(run_id)
-    return run_id, wrong
+    return run_id, interrupted, wrong
 
 
 def _after_restart(cell: CellRun, run_id: str, before: list[str]) -> list[str]:
@@ -66,24 +70,45 @@ def _after_restart(cell: CellRun, run_id: str, before: list[str]) -> list[str]:
 
 
 def soak(kills: int, per_run: int, seed: int, folder: Path) -> list[str]:
-    """Kill `kills` times, `per_run` times in each run; all failures."""
+    """Interrupt runs `kills` times, each of them up to `per_run` times; all failures.
+
+    A run that is resumed takes longer than one that is not, so some runs are killed only once: any
+    instant until the very end is as likely as any other. Kills after the end do not count.
+    """
     chance = random.Random(seed)
     expected, span_s = reference(folder / "reference")
     wrong: list[str] = []
-    done = 0
-    while done < kills:
-        count = min(per_run, kills - done)
-        with cell_run(folder / f"killed-{done:03}") as cell:
-            run_id, failures = killed(cell, count, span_s / per_run, chance)
-            wrong += failures
-            done += cell.kills
+    done = runs = 0
+    while done < kills and runs < 4 * kills:
+        runs += 1
+        count = min(chance.randint(1, per_run), kills - done)
+        instants = sorted(chance.uniform(0.0, span_s) for _ in range(count))
+        interrupted, failures = one_run(folder / f"killed-{runs:03}", instants, expected)
+        wrong += failures
+        done += interrupted
+        print(f"{done} of {kills} kills, {len(wrong)} failures", flush=True)
+    if done < kills:
+        wrong.append(f"only {done} of {kills} kills interrupted a run")
+    return wrong
+
+
+def one_run(
+    folder: Path, instants: Sequence[float], expected: dict[str, Any]
+) -> tuple[int, list[str]]:
+    """How many of the kills interrupted a run, and what went wrong until its end."""
+    interrupted, wrong = 0, list[str]()
+    try:
+        with cell_run(folder) as cell:
+            run_id, interrupted, wrong = killed(cell, instants)
             info = cell.finish(run_id)
             if info.status != "done":
                 wrong.append(f"{run_id}: ended {info.status}: {info.error}")
             elif cell.result(run_id) != expected:
                 wrong.append(f"{run_id}: another result than the uninterrupted run")
-        print(f"{done} of {kills} kills, {len(wrong)} failures", flush=True)
-    return wrong
+    except (CellctlError, AssertionError) as error:
+        at = ", ".join(f"{instant:.2f}" for instant in instants)
+        wrong.append(f"{folder.name}, killed at {at} s: {type(error).__name__}: {error}")
+    return interrupted, wrong
 
 
 def main() -> int:
