@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cellctl.arms import JOINTS
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Path
@@ -15,7 +14,7 @@ from cellctl.geometry import Array, Transform
 from cellctl.ik import random_starts
 from cellctl.motion import Guard
 from cellctl.procedures.routing import Roadmap, shortened
-from cellctl.procedures.sweep import go
+from cellctl.procedures.sweep import go, gone, posture
 from cellctl.run import Run
 
 MARGIN_M = 0.05
@@ -125,12 +124,10 @@ async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> Non
     await run.step(PARK)
     recorded = next((r for r in run.records(PARKED) if r["key"] == key), None)
     if recorded is None:
-        here = (await cell.robot.read()).joints
+        here = await posture(run, cell)
         margin = MARGIN_M + cell.config.tape.position_m
         light = beams(cell.config, T_world_camera)
-        path: Path | None = await run.call(
-            way_out, cell.guard, light, here, _visited(run), margin, 0
-        )
+        path: Path | None = await run.call(way_out, cell.guard, light, here, gone(run), margin, 0)
         if path is None:
             raise MotionRefused(
                 "no allowed posture leaves the light free: widen the workspace box, or move "
@@ -142,11 +139,5 @@ async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> Non
     await run.checkpoint("the arm moves out of the light")
     async with run.taking(key):
         await go(run, cell, way, way)
-
-
-def _visited(run: Run) -> Array:
-    """Corners (n, 6) of all that the arm has gone along in this run, oldest first."""
-    ways = [r["way"] for r in run.records(PARKED)]
-    steps = run.all_samples().values()
-    ways += [s.data["way"] for step in steps for s in step.values() if "way" in s.data]
-    return np.array([corner for way in ways for corner in way]).reshape(-1, JOINTS)
+    if key not in run.samples():
+        await run.sample(key, {"way": recorded["way"]})

@@ -69,7 +69,8 @@ def pictures_of(config: CellConfig, params: ProjectorParams) -> list[patterns.Ma
 async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
     """Park the arm, show all pictures, and the first one again."""
     shown = pictures_of(cell.config, params)
-    await park(run, cell, knowledge.T_world_camera, PICTURES)
+    if not run.samples(AGAIN):
+        await park(run, cell, knowledge.T_world_camera, PICTURES)
     await _take(run, cell, PICTURES, shown)
     await _take(run, cell, AGAIN, shown[:1])
     await darken(cell)
@@ -77,6 +78,8 @@ async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Know
 
 async def look_before(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
     """Show the first picture, for comparison at the end of a long run."""
+    if run.samples(BEFORE):
+        return
     await park(run, cell, knowledge.T_world_camera, BEFORE)
     await _take(run, cell, BEFORE, pictures_of(cell.config, params)[:1])
 

@@ -7,6 +7,7 @@ next picture and ends as it would have ended.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +34,7 @@ from cellctl.procedures.planning import (
 )
 from cellctl.procedures.rig import PlannedView
 from cellctl.run import Run
+from cellctl.store.history import Sample
 
 SEARCH_ATTEMPTS, SEARCH_SEEDS = 4, 1000
 SEARCH_EDGE = 0.05
@@ -89,14 +91,14 @@ async def _choice(run: Run, cell: Cell, sweep: Sweep, belief: Belief, i: int) ->
     """The way (n, 6) to the next search view; recalled when it was journalled before a crash."""
     chosen = next((r for r in run.records("choice") if r["index"] == i), None)
     if chosen is None:
-        here = (await cell.robot.read()).joints
+        here = await posture(run, cell)
         found = await run.call(
             next_search,
             cell.guard,
             belief,
             sweep.board,
             _found(run, sweep.board),
-            _visited(run),
+            _visited(run.samples()),
             here,
             i,
         )
@@ -115,9 +117,23 @@ def _found(run: Run, board: Board) -> list[RobotView]:
     return [view for view in views if view is not None]
 
 
-def _visited(run: Run) -> Array:
-    """The postures (n, 6) that the search has been in."""
-    return np.array([s.data["way"][-1] for s in run.samples().values()]).reshape(-1, JOINTS)
+def _visited(samples: Mapping[str, Sample]) -> Array:
+    """The postures (n, 6) that a search has been in."""
+    return np.array([s.data["way"][-1] for s in samples.values()]).reshape(-1, JOINTS)
+
+
+def gone(run: Run) -> Array:
+    """Corners (n, 6) of all that the arm has gone along in this run, oldest first."""
+    steps = run.all_samples().values()
+    ways = [s.data["way"] for step in steps for s in step.values() if "way" in s.data]
+    return np.array([corner for way in ways for corner in way]).reshape(-1, JOINTS)
+
+
+async def posture(run: Run, cell: Cell) -> Array:
+    """Where plans start, joints (6,): the posture that this run has sent the arm to last, or where
+    it stands. A resumed run, whose arm may stand somewhere else, plans as it would have."""
+    corners = gone(run)
+    return corners[-1] if len(corners) else (await cell.robot.read()).joints
 
 
 def next_search(
@@ -149,7 +165,7 @@ async def _plan(run: Run, cell: Cell, sweep: Sweep, belief: Belief) -> list[Plan
     recorded = run.recall(PLAN)
     if recorded is None:
         run.progress(0, "planning views")
-        here = (await cell.robot.read()).joints
+        here = await posture(run, cell)
         rig = belief.rig(sweep.board)
         views = await run.call(
             plan_sweep, rig, cell.guard, here, sweep.spread, sweep.count, sweep.seed

@@ -60,11 +60,6 @@ def test_pictures_and_poses_are_on_disk(done):
     assert all((folder / name).is_file() for name in named)
 
 
-@pytest.mark.xfail(
-    strict=False,
-    reason="a search that is resumed between a picture and its next choice chooses from where the "
-    "arm is then, not from where the picture was taken",
-)
 def test_killed_and_resumed_it_ends_with_the_same_result(done, tmp_path):
     cell, info = done
     with cell_run(tmp_path) as other:
