@@ -108,6 +108,21 @@ def test_a_wrong_board_size_is_found():
     assert off_mm(result.camera_pose, X) < 1.5
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("scale", [0.9, 0.95, 1.05])
+def test_another_board_than_stated_is_no_pass_and_does_not_bend_the_camera(mount, scale):
+    """The camera comes from the same views, so pictures alone would hide it."""
+    seen = robot_views(3, mount, scale=scale, count=9, robot=(0.2e-3, 0.02))
+    result = solve_hand_eye(seen, mount, image_size=SIZE)
+    verdict, reasons = judge(result)
+    assert verdict == "fail"
+    way = "smaller" if scale < 1 else "larger"
+    assert [reason for reason in reasons if f"% {way} than stated" in reason] == list(reasons)
+    assert result.scale == pytest.approx(scale, abs=3e-3)
+    assert np.abs(result.camera.vector[:2] - CAMERA.vector[:2]).max() < 5
+    assert off_mm(result.camera_pose, X) < 5
+
+
 def test_the_camera_may_come_from_the_same_views():
     seen = robot_views(4, count=9, robot=(0.2e-3, 0.02))
     result = solve_hand_eye(seen, "eye-to-hand", image_size=SIZE)
