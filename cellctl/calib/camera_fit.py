@@ -180,7 +180,10 @@ def _zhang(views: Sequence[View], image_size: tuple[int, int]) -> list[float]:
     """Focal length from the homographies (Z. Zhang, 2000), if they yield a sensible one."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    focal = float(cv2.initCameraMatrix2D(points, pixels, image_size, 1.0)[0, 0])
+    try:
+        focal = float(cv2.initCameraMatrix2D(points, pixels, image_size, 1.0)[0, 0])
+    except cv2.error:  # OpenCV finds no homography in single precision
+        return []
     return [focal] if 0.1 < focal / max(image_size) < 100.0 else []
 
 

@@ -87,9 +87,10 @@ def judge(
         reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
     if total - used > limits.rejected * total:
         reasons.append(f"{total - used} of {total} views were rejected")
-    if not result.held_out_px <= limits.held_out_px:
+    if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
-            f"held-out error {result.held_out_px:.2f} px, over the limit of {limits.held_out_px} px"
+            f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
+            f"{limits.held_out_px} px"
         )
     focal_sigma = float(np.max(result.sigma[:2] / result.camera.vector[:2]))
     if not focal_sigma <= limits.focal_sigma:

@@ -111,6 +111,16 @@ def test_bad_views_are_rejected_by_name():
     assert result.held_out_used_px < 0.2 < result.held_out_px
 
 
+def test_a_rejected_view_counts_by_its_share_and_not_by_its_error():
+    seen = views(6, count=14)
+    noise = np.random.default_rng(0).normal(0, 8.0, (54, 2))
+    seen[3] = replace(seen[3], pixels=seen[3].pixels + noise)
+    result = solve_intrinsic(seen, SIZE)
+    assert [r.id for r in result.rejected] == ["v03"]
+    assert result.held_out_px > IntrinsicLimits().held_out_px > result.held_out_used_px
+    assert judge(result) == ("pass", ())
+
+
 def test_too_few_views_say_so():
     with pytest.raises(SolveError, match=r"2 usable views .* at least 3"):
         solve_intrinsic(views(7, count=2), SIZE)
