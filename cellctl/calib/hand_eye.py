@@ -105,7 +105,7 @@ def _job(
         found, lost = possible_poses(views, camera)
     else:
         fit, rejected = _camera_of(views, image_size, minimum_points)
-        fit, found, lost = _located(views, fit)
+        fit, found, lost = located(views, fit)
         camera, warp = fit.camera, fit.state.warp
     rejected = [*rejected, *lost]
     require_views([view for view in views if view.id in found], rejected, NEED)
@@ -128,7 +128,7 @@ def _camera_of(
     return best.fit, best.rejected
 
 
-def _located(
+def located(
     views: list[RobotView], fit: CameraFit
 ) -> tuple[CameraFit, dict[str, Possible], list[Rejection]]:
     """What the pictures allow under a camera that came from them. A view that has no pose under

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cellctl.calib.camera_fit import CameraOption, fit_camera
 from cellctl.calib.closed_form import METHODS, axis_scatter_deg, closed_form, robust_start
-from cellctl.calib.hand_eye import HandEyeLimits, judge, solve_hand_eye
+from cellctl.calib.hand_eye import HandEyeLimits, judge, located, solve_hand_eye
 from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.hand_eye_fit import options
 from cellctl.calib.targets import Chessboard
@@ -242,6 +244,31 @@ def test_the_start_stands_almost_half_of_the_views_being_wrong():
     C = invert(X) @ A @ Y
     C[:5] = C[[1, 2, 3, 4, 0]]
     assert np.allclose(robust_start(A, C), (X, Y), atol=1e-6)
+
+
+def test_many_views_need_no_list_of_all_subsets():
+    rng = np.random.default_rng(4)
+    A = np.array([pose_matrix(rng.normal(size=3), rng.normal(size=3)) for _ in range(80)])
+    tracemalloc.start()
+    try:
+        found = robust_start(A, invert(X) @ A @ Y)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.allclose(found, (X, Y), atol=1e-9)
+    assert peak < 10e6
+
+
+def test_a_view_lost_under_the_camera_is_lost_to_the_camera_too():
+    """Here because its corners lie where the camera's distortion has no inverse."""
+    seen = robot_views(14, count=8)
+    fit, _ = fit_camera(seen, SIZE, CameraOption(warp=False))
+    folding = replace(fit.camera, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    bent = replace(fit, solution=replace(fit.solution, state=replace(fit.state, camera=folding)))
+    again, found, lost = located(seen, bent)
+    assert lost
+    assert again.names == tuple(found)
+    assert {r.id for r in lost} | set(found) == {view.id for view in seen}
 
 
 def test_scatter_is_that_of_the_axes():
