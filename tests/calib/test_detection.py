@@ -91,6 +91,18 @@ def test_marker_corners_beat_opencvs():
     assert centres.std() < 0.035
 
 
+def test_a_small_marker_does_not_spoil_the_others():
+    """One that belongs to something else, in a corner of the picture."""
+    image, _ = shot(GRID, 33.0)
+    alone = find_markers(image, "DICT_4X4_50")
+    image[10:60, 10:60] = 255
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image[25:43, 25:43] = cv2.aruco.generateImageMarker(family, 40, 18)
+    both = find_markers(image, "DICT_4X4_50")
+    assert both.ids.tolist() == [*alone.ids.tolist(), 40]
+    assert np.abs(both.corners[:-1] - alone.corners).max() < 1e-9
+
+
 @pytest.mark.parametrize("spin", [0.0, 90.0, 180.0, 270.0])
 @pytest.mark.parametrize("board", [CHESS, Chessboard((6, 9), 0.03)])
 def test_colours_tell_the_ends_of_a_chessboard_apart(board, spin):
