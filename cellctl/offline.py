@@ -11,7 +11,7 @@ from cellctl.calib import hand_eye, intrinsic
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import usable_views
 from cellctl.calib.intrinsic import IntrinsicLimits, IntrinsicResult
-from cellctl.calib.observe import Observed, observe, observe_with_robot
+from cellctl.calib.observe import NOT_FOUND, Observed, observe, observe_with_robot
 from cellctl.calib.views import Rejection, View
 from cellctl.dataset import Dataset, load_dataset
 from cellctl.errors import BadInput, SolveError
@@ -113,10 +113,11 @@ def _require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
     if seen.sights:
         return
     board = ", ".join(f"{name} {value}" for name, value in dataset.board.to_dict().items())
-    first = seen.unseen[0]
+    told = [r for r in seen.unseen if r.reason != NOT_FOUND][:1]
+    clue = "".join(f"; view {r.id!r}: {r.reason}" for r in told)
     raise BadInput(
         f"{dataset.where}: {key}: the board ({board}) is not seen in any picture; check its "
-        f"type, its counts and its dictionary (view {first.id!r}: {first.reason})"
+        f"type, its counts and its dictionary{clue}"
     )
 
 

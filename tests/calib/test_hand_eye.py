@@ -14,6 +14,7 @@ from cellctl.calib.closed_form import METHODS, axis_scatter_deg, closed_form, ro
 from cellctl.calib.hand_eye import HandEyeLimits, judge, located, solve_hand_eye
 from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.hand_eye_fit import options
+from cellctl.calib.intrinsic import solve_intrinsic
 from cellctl.calib.targets import Chessboard
 from cellctl.calib.views import RobotView
 from cellctl.errors import SolveError
@@ -132,6 +133,16 @@ def test_the_camera_may_come_from_the_same_views():
     assert off_mm(result.camera_pose, X) < 5
     with pytest.raises(SolveError, match="size of the pictures"):
         solve_hand_eye(seen, "eye-to-hand")
+
+
+def test_the_camera_is_chosen_as_by_the_intrinsic_solver():
+    """A flat board stays flat when its views carry robot poses."""
+    for seed in (4, 15, 16):
+        seen = robot_views(seed, count=9, robot=(0.2e-3, 0.02))
+        alone = solve_intrinsic(seen, SIZE)
+        result = solve_hand_eye(seen, "eye-to-hand", image_size=SIZE)
+        assert "warp" not in result.chosen
+        assert np.array_equal(result.warp, alone.warp)
 
 
 def test_the_order_of_the_views_does_not_matter():

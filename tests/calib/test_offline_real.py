@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cellctl.calib.camera import CameraModel
+from cellctl.errors import BadInput
 from cellctl.geometry import rigid
 from cellctl.offline import solve_dataset
 
@@ -106,6 +107,19 @@ def test_copies_of_pictures_change_nothing(shared_data, tmp_path):
     assert {r["reason"] for r in doubled["views"]["rejected"]} == {
         f"the same picture as view '{name}'" for name in plain["views"]["used"]
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "words"),
+    [
+        ("opencv_left_intr", {"inner_corners": [8, 6]}, "goes on beyond 8x6 inner corners"),
+        ("ur_charuco_eih", {"legacy": True}, "legacy is stated wrong"),
+    ],
+)
+def test_a_board_stated_wrong_is_bad_input(shared_data, tmp_path, name, wrong, words):
+    folder = copied(shared_data / name, tmp_path, lambda d: d["board"].update(wrong))
+    with pytest.raises(BadInput, match=f"not seen in any picture.*{words}"):
+        solve_dataset(folder)
 
 
 def test_a_board_of_another_size_fails_and_says_so(shared_data, tmp_path):
