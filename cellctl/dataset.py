@@ -27,6 +27,11 @@ FILE = "dataset.json"
 KINDS = ("intrinsic", "hand-eye")
 LATER_KINDS = ("projector-graycode", "markers")
 
+AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+"""Cameras write how they were held; a calibration is that of the sensor."""
+FARTHEST_M = 100.0
+"""No arm reaches that far: longer poses are in millimetres, or wrong."""
+
 Mount = Literal["eye-to-hand", "eye-in-hand"]
 Side = Annotated[int, Field(ge=16, le=32768, strict=True)]
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -111,7 +116,7 @@ def load_dataset(folder: Path) -> Dataset:
     if with_robot and content.mount is None:
         raise BadInput(f"{path}: a hand-eye data set needs mount: eye-to-hand or eye-in-hand")
     intrinsic = [
-        view if isinstance(view, _View) else _View(id=Path(view).stem, image=view)
+        view if isinstance(view, _View) else _View(id=view, image=view)
         for view in content.intrinsic_images
     ]
     return Dataset(
@@ -129,7 +134,7 @@ def load_dataset(folder: Path) -> Dataset:
 def read_picture(path: Path, size: tuple[int, int], where: str) -> NDArray[np.uint8]:
     """A grey picture (h, w) of the given (w, h). BadInput says `where` it is wanted."""
     try:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imread(str(path), AS_STORED)
     except cv2.error as error:
         raise BadInput(f"{where}: {path.name} cannot be read: {error.err}") from None
     if image is None:
@@ -180,8 +185,11 @@ def _pictures(views: list[_View], path: Path, *, with_robot: bool) -> tuple[Pict
 
 def _image(path: Path, view: _View, where: str) -> Path:
     relative = Path(view.image)
-    if relative.is_absolute():
-        raise BadInput(f"{where}: image must be a path relative to the folder, not {view.image!r}")
+    if relative.is_absolute() or ".." in relative.parts:
+        raise BadInput(
+            f"{where}: image must be a path relative to the folder and within it, not "
+            f"{view.image!r}"
+        )
     try:
         exists = (path.parent / relative).is_file()
     except (OSError, ValueError):
@@ -196,7 +204,11 @@ def _flange(view: _View, where: str, with_robot: bool) -> Transform | None:
         return None
     if view.T_base_flange is None:
         raise BadInput(f"{where}: missing key 'T_base_flange', the pose that the robot reported")
-    return as_transform("base", "flange", view.T_base_flange, where)
+    pose = as_transform("base", "flange", view.T_base_flange, where)
+    length = float(np.linalg.norm(pose.translation))
+    if length > FARTHEST_M:
+        raise BadInput(f"{where}: T_base_flange is {length:.4g} m long; are these millimetres?")
+    return pose
 
 
 def _explain(error: ValidationError, document: dict[str, Any]) -> str:

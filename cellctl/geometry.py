@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,10 @@ Array = NDArray[Any]
 Mask = NDArray[Any]
 """Of bool."""
 
-RIGID_TOLERANCE = 1e-4
-"""How far R^T R may be from the identity before a matrix is refused. Poses that were printed
-with four digits pass; a swapped axis or a scaled rotation does not. What passes is projected
-onto the nearest rotation."""
+RIGID_TOLERANCE = 2e-3
+"""How far R^T R may be from the identity before a matrix is refused. Rotations that were printed
+with three decimals pass, for they are off by 2 sqrt(3) 5e-4 at most; a swapped axis or a scaled
+rotation does not. What passes is projected onto the nearest rotation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +93,25 @@ def rigid(value: ArrayLike, name: str) -> Array:
     """A (4, 4) copy of `value`, its rotation made exact. BadInput names what is wrong with it."""
     try:
         matrix = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadInput(f"{name} is not a matrix of numbers: {error}") from None
     if matrix.shape != (4, 4):
         raise BadInput(f"{name} must be a 4x4 matrix, not of shape {matrix.shape}")
+    if not isinstance(value, np.ndarray):
+        _check_leaves(value, name)
     if not np.isfinite(matrix).all():
         raise BadInput(f"{name} holds a number that is not finite")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise BadInput(f"{name} is not rigid: its last row is {matrix[3].tolist()}, not 0 0 0 1")
     matrix[:3, :3] = _nearest_rotation(matrix[:3, :3], name)
     return matrix
+
+
+def _check_leaves(rows: Any, name: str) -> None:
+    """BadInput on text, null or true in a (4, 4) nested list: NumPy reads them as numbers."""
+    for leaf in (leaf for row in rows for leaf in row):
+        if isinstance(leaf, bool) or not isinstance(leaf, Real):
+            raise BadInput(f"{name} is not a matrix of numbers: it holds {leaf!r}")
 
 
 def _nearest_rotation(block: Array, name: str) -> Array:
@@ -138,16 +147,6 @@ def invert(matrix: Array) -> Array:
 def transform_points(matrix: Array, points: Array) -> Array:
     """Apply one (4, 4) matrix to points (..., 3)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def mean_transform(transforms: Sequence[Transform]) -> Transform:
-    """Chordal mean of the rotations and arithmetic mean of the translations; frames must agree."""
-    first = transforms[0]
-    if any((t.parent, t.child) != (first.parent, first.child) for t in transforms):
-        raise FrameError("the mean of transforms between different frames has no meaning")
-    rotation = Rotation.from_matrix(np.stack([t.rotation for t in transforms])).mean()
-    translation = np.mean([t.translation for t in transforms], axis=0)
-    return Transform(first.parent, first.child, pose_matrix(rotation.as_rotvec(), translation))
 
 
 def rotation_angle(matrix: Array) -> float:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cellctl.calib import hand_eye, intrinsic
 from cellctl.calib.camera import CameraModel
-from cellctl.calib.observe import observe, observe_with_robot
-from cellctl.calib.views import Rejection
+from cellctl.calib.camera_fit import usable_views
+from cellctl.calib.intrinsic import IntrinsicLimits, IntrinsicResult
+from cellctl.calib.observe import NOT_FOUND, Observed, observe, observe_with_robot
+from cellctl.calib.views import Rejection, View
 from cellctl.dataset import Dataset, load_dataset
-from cellctl.errors import BadInput
+from cellctl.errors import BadInput, SolveError
 from cellctl.procedures.again import solve_run
+
+CAME_ALONG = IntrinsicLimits(views=3, coverage=0.0, rejected=1.0)
+"""What pictures for the camera alone must reach: no more than is asked of a camera that comes
+from the hand-eye views, which show whether it is good where it counts."""
 
 
 def solve_folder(folder: Path) -> dict[str, Any]:
@@ -25,8 +32,9 @@ def solve_folder(folder: Path) -> dict[str, Any]:
 def solve_dataset(folder: Path) -> dict[str, Any]:
     """Solve the data set in `folder`: what `cellctl solve --json` prints.
 
-    BadInput names what cannot be used, a board that no picture shows included. SolveError when
-    what is there does not determine an answer. The order of the views does not matter.
+    BadInput names what cannot be used, a board that no picture shows included. When what is there
+    does not determine an answer, the verdict is a fail with that reason. The order of the views
+    does not matter.
     """
     dataset = load_dataset(folder)
     solve = {"intrinsic": _solve_intrinsic, "hand-eye": _solve_hand_eye}[dataset.kind]
@@ -35,60 +43,96 @@ def solve_dataset(folder: Path) -> dict[str, Any]:
 
 def _solve_intrinsic(dataset: Dataset) -> dict[str, Any]:
     seen = observe(dataset.board, dataset.images())
-    _require_board(seen.views, dataset, "views")
-    result = intrinsic.solve_intrinsic(
-        seen.views, dataset.image_size, minimum_points=dataset.board.minimum_points
-    )
-    verdict, reasons = intrinsic.judge(result)
-    return _document(result.to_dict(), verdict, reasons, seen.unseen)
+    _require_board(seen, dataset, "views")
+    try:
+        result = _camera_from(seen, dataset, dataset.image_size)
+    except SolveError as error:
+        return _unsolved(error, seen, dataset)
+    _, reasons = intrinsic.judge(result)
+    return _judged(reasons, result.to_dict())
 
 
 def _solve_hand_eye(dataset: Dataset) -> dict[str, Any]:
     assert dataset.mount is not None
-    camera, doubts = _camera(dataset) if dataset.intrinsic_pictures else (None, ())
     seen = observe_with_robot(dataset.board, dataset.images_with_robot())
-    _require_board(seen.views, dataset, "views")
-    result = hand_eye.solve_hand_eye(
-        seen.views,
-        dataset.mount,
-        camera=camera,
-        image_size=dataset.image_size,
-        minimum_points=dataset.board.minimum_points,
-    )
-    verdict, reasons = hand_eye.judge(result)
-    if doubts:
-        verdict, reasons = "fail", (*doubts, *reasons)
-    return _document(result.to_dict(), verdict, reasons, seen.unseen)
+    _require_board(seen, dataset, "views")
+    doubts: tuple[str, ...] = ()
+    camera: CameraModel | None = None
+    extra: dict[str, Any] = {}
+    try:
+        if dataset.intrinsic_pictures:
+            camera, doubts, extra = _camera_that_came_along(dataset)
+        result = hand_eye.solve_hand_eye(
+            seen.views,
+            dataset.mount,
+            camera=camera,
+            image_size=dataset.image_size,
+            minimum_points=dataset.board.minimum_points,
+        )
+    except SolveError as error:
+        return {**_unsolved(error, seen, dataset), **extra}
+    result = replace(result, rejected=_merged(result.rejected, seen.unseen))
+    _, reasons = hand_eye.judge(result)
+    return {**_judged((*doubts, *reasons), result.to_dict()), **extra}
 
 
-def _camera(dataset: Dataset) -> tuple[CameraModel, tuple[str, ...]]:
-    """The camera from the data set's own intrinsic pictures, for the hand-eye pictures' size;
-    and why it may not be good enough."""
-    seen = observe(dataset.board, dataset.intrinsic_images())
-    _require_board(seen.views, dataset, "intrinsic_images")
+def _camera_from(
+    seen: Observed[View], dataset: Dataset, image_size: tuple[int, int]
+) -> IntrinsicResult:
+    """Solved; the pictures that yielded no view are among the rejected."""
     result = intrinsic.solve_intrinsic(
-        seen.views, dataset.intrinsic_image_size, minimum_points=dataset.board.minimum_points
+        seen.views, image_size, minimum_points=dataset.board.minimum_points
     )
-    _, reasons = intrinsic.judge(result)
+    return replace(result, rejected=_merged(result.rejected, seen.unseen))
+
+
+def _camera_that_came_along(
+    dataset: Dataset,
+) -> tuple[CameraModel, tuple[str, ...], dict[str, Any]]:
+    """The camera from the data set's own intrinsic pictures, for the hand-eye pictures' size;
+    why it is not good enough; and what there is to say about it."""
+    seen = observe(dataset.board, dataset.intrinsic_images())
+    _require_board(seen, dataset, "intrinsic_images")
+    try:
+        result = _camera_from(seen, dataset, dataset.intrinsic_image_size)
+    except SolveError as error:
+        raise SolveError(f"intrinsic_images: {error.message}") from None
     try:
         camera = result.camera.scaled(dataset.image_size)
     except BadInput as error:
         raise BadInput(f"{dataset.where}: intrinsic_image_size: {error.message}") from None
-    return camera, tuple(f"camera: {reason}" for reason in reasons)
+    _, doubts = intrinsic.judge(result, CAME_ALONG)
+    _, remarks = intrinsic.judge(result)
+    document = result.to_dict()
+    facts = {key: document[key] for key in ("views", "rms_px", "held_out_px")}
+    facts["remarks"] = [remark for remark in remarks if remark not in doubts]
+    return camera, tuple(f"intrinsic_images: {doubt}" for doubt in doubts), {"intrinsic": facts}
 
 
-def _require_board(views: Sequence[Any], dataset: Dataset, key: str) -> None:
-    if not views:
-        board = ", ".join(f"{name} {value}" for name, value in dataset.board.to_dict().items())
-        raise BadInput(
-            f"{dataset.where}: {key}: the board ({board}) is not seen in any picture; check its "
-            "type, its counts and its dictionary"
-        )
+def _require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
+    if seen.sights:
+        return
+    board = ", ".join(f"{name} {value}" for name, value in dataset.board.to_dict().items())
+    told = [r for r in seen.unseen if r.reason != NOT_FOUND][:1]
+    clue = "".join(f"; view {r.id!r}: {r.reason}" for r in told)
+    raise BadInput(
+        f"{dataset.where}: {key}: the board ({board}) is not seen in any picture; check its "
+        f"type, its counts and its dictionary{clue}"
+    )
 
 
-def _document(
-    result: dict[str, Any], verdict: str, reasons: Sequence[str], unseen: Sequence[Rejection]
-) -> dict[str, Any]:
-    rejected = [*result["views"]["rejected"], *(rejection.to_dict() for rejection in unseen)]
-    views = {**result["views"], "rejected": sorted(rejected, key=lambda item: item["id"])}
-    return {"verdict": verdict, "reasons": list(reasons), **result, "views": views}
+def _judged(reasons: Sequence[str], solved: dict[str, Any]) -> dict[str, Any]:
+    return {"verdict": "fail" if reasons else "pass", "reasons": list(reasons), **solved}
+
+
+def _unsolved(error: SolveError, seen: Observed[Any], dataset: Dataset) -> dict[str, Any]:
+    """No answer, said as every answer is: pictures that are too few or too alike are no misuse."""
+    _, few = usable_views(seen.views, dataset.board.minimum_points)
+    rejected = [rejection.to_dict() for rejection in _merged(few, seen.unseen)]
+    return _judged([error.message], {"views": {"used": [], "rejected": rejected}})
+
+
+def _merged(rejected: Sequence[Rejection], unseen: Sequence[Rejection]) -> tuple[Rejection, ...]:
+    """By id: those that the solver rejected, and the pictures that never reached it. A verdict
+    counts both."""
+    return tuple(sorted([*rejected, *unseen], key=lambda rejection: rejection.id))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from cellctl.errors import BadInput, FrameError
-from cellctl.geometry import Transform, invert, look_down, mean_transform, pose_matrix
+from cellctl.geometry import Transform, invert, look_down
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3)
 
@@ -36,6 +37,10 @@ def test_wrong_order_raises_by_name():
         (np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrors"),
         (np.full((4, 4), np.nan), "not finite"),
         ("no", "not a matrix"),
+        ([[10**400, 0, 0, 0], *np.eye(4)[1:].tolist()], "not a matrix of numbers: int too large"),
+        ([["1.0", 0, 0, 0], *np.eye(4)[1:].tolist()], "not a matrix of numbers: it holds '1.0'"),
+        ([[True, 0, 0, 0], *np.eye(4)[1:].tolist()], "not a matrix of numbers: it holds True"),
+        ([[1, 0, 0, None], *np.eye(4)[1:].tolist()], "not a matrix of numbers: it holds None"),
     ],
 )
 def test_bad_matrix_is_named(matrix, words):
@@ -43,20 +48,21 @@ def test_bad_matrix_is_named(matrix, words):
         Transform("a", "b", matrix)
 
 
-def test_rounded_rotation_is_made_exact():
-    rounded = np.round(pose_matrix((0.3, -0.2, 0.5), (1, 2, 3)), 5)
-    rotation = Transform("a", "b", rounded).rotation
-    assert np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-14)
+@pytest.mark.parametrize("decimals", [3, 4, 5])
+def test_rounded_rotations_are_made_exact(decimals):
+    """As teach pendants and log files print them, whatever the rotation."""
+    exact = Rotation.random(300, np.random.default_rng(0)).as_matrix()
+    for true in exact:
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.round(true, decimals)
+        rotation = Transform("a", "b", matrix).rotation
+        assert np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-14)
+        assert np.abs(rotation - true).max() < 10.0**-decimals
 
 
 def test_matrix_is_read_only():
     with pytest.raises(ValueError):
         Transform.identity("a", "b").matrix[0, 0] = 2
-
-
-def test_mean_of_symmetric_scatter_is_its_centre():
-    poses = [Transform.from_rvec("a", "b", (0, 0, s), (s, 0, 1)) for s in (-0.1, 0.0, 0.1)]
-    assert np.allclose(mean_transform(poses).matrix, pose_matrix((0, 0, 0), (0, 0, 1)))
 
 
 def test_look_down_sees_its_aim_on_the_optical_axis():

@@ -106,28 +106,29 @@ def _side_lines(image: Grey, corners: Array, modules: int) -> tuple[Array, Array
     middle = corners + 0.5 * length * along
     places = length * np.linspace(-0.35, 0.35, LINES)
     feet = middle[..., None, :] + places[..., None] * along[..., None, :]
-    offsets = _edge_offsets(image, feet, outward, float(length.min()) / modules)
+    offsets = _edge_offsets(image, feet, outward, length.min(axis=(1, 2)) / modules)
     intercept, slope = _fit_lines(places, offsets)
     return middle + intercept[..., None] * outward, along + slope[..., None] * outward
 
 
-def _edge_offsets(image: Grey, feet: Array, outward: Array, module: float) -> Array:
-    """How far (m, 4, l) the dark-to-bright edge lies outward of each foot (m, 4, l, 2).
+def _edge_offsets(image: Grey, feet: Array, outward: Array, modules: Array) -> Array:
+    """How far (m, 4, l) the dark-to-bright edge lies outward of each foot (m, 4, l, 2), with
+    profiles as long as the `modules` (m,) px of each marker allow.
 
     An edge of any symmetric blur lies where the area under its profile says: the integral of
     (I - dark) / (bright - dark) from -a to b is b - offset. Not-a-number where there is no edge.
     """
-    inner = float(np.clip(0.6 * module, 1.5, 5.0))
-    outer = float(np.clip(0.75 * module, 2.0, 5.0))
-    steps = np.arange(-inner, outer + 1e-9, STEP_PX)
-    places = feet[..., None, :] + steps[:, None] * outward[:, :, None, None, :]
-    profile = sample(image, places)
+    inner = np.clip(0.6 * modules, 1.5, 5.0)
+    outer = np.clip(0.75 * modules, 2.0, 5.0)
+    count = int(np.ceil((inner + outer).max() / STEP_PX)) + 1
+    steps = np.linspace(-inner, outer, count, axis=-1)[:, None, None, :, None]
+    profile = sample(image, feet[..., None, :] + steps * outward[:, :, None, None, :])
     dark, bright = profile[..., :2].mean(axis=-1), profile[..., -2:].mean(axis=-1)
     rise = bright - dark
-    area = STEP_PX * (profile[..., 1:] + profile[..., :-1]).sum(axis=-1) / 2.0
-    width = STEP_PX * (len(steps) - 1)
+    mean = (profile[..., 1:] + profile[..., :-1]).mean(axis=-1) / 2.0
+    inner, outer = inner[:, None, None], outer[:, None, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        offset = steps[-1] - (area - dark * width) / rise
+        offset = outer - (inner + outer) * (mean - dark) / rise
     return np.where((rise > MINIMUM_CONTRAST) & (np.abs(offset) < outer), offset, np.nan)
 
 

@@ -182,14 +182,11 @@ def distort_slopes(xy: Array, coefficients: Array) -> tuple[Array, Array]:
     r2 = xx + yy
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-    warped = np.empty_like(xy)
-    warped[..., 0] = x * radial + p1 * xy2 + p2 * (r2 + 2.0 * xx)
-    warped[..., 1] = y * radial + p1 * (r2 + 2.0 * yy) + p2 * xy2
     by_xy = np.empty((*xy.shape, 2))
     by_xy[..., 0, 0] = radial + xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
     by_xy[..., 1, 1] = radial + yy * slope + 6.0 * p1 * y + 2.0 * p2 * x
     by_xy[..., 0, 1] = by_xy[..., 1, 0] = 0.5 * xy2 * slope + 2.0 * (p1 * x + p2 * y)
-    return warped, by_xy
+    return distort(xy, coefficients), by_xy
 
 
 def coefficient_slopes(xy: Array) -> Array:

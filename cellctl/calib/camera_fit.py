@@ -24,6 +24,7 @@ FAR_BEYOND, FAR_SIGMAS, FAR_PX = 3.0, 5.0, 0.1
 """A view is rejected when its error is that many times the median view's, that many robust
 standard deviations above it, and that many pixels."""
 NO_POSE = "no pose of the board explains the picture"
+NEED = f"views of the board; a camera needs at least {MINIMUM_VIEWS}, tilted in different ways"
 FOCAL_GUESSES = (0.6, 1.0, 1.7, 3.0)
 """In longer sides of the picture, tried beside the closed form."""
 
@@ -98,7 +99,7 @@ def fit_camera(
     """
     usable, rejected = usable_views(views, minimum_points)
     while True:
-        _require(usable, rejected)
+        require_views(usable, rejected, NEED)
         camera, poses = _start(usable, image_size)
         bad = {view.id: NO_POSE for view in usable if view.id not in poses}
         if not bad:
@@ -125,13 +126,11 @@ def usable_views(views: Sequence[AnyView], minimum: int) -> tuple[list[AnyView],
     return usable, rejected
 
 
-def _require(views: Sequence[View], rejected: Sequence[Rejection]) -> None:
+def require_views(views: Sequence[View], rejected: Sequence[Rejection], need: str) -> None:
+    """SolveError with the `need` in words, and why others were rejected, below MINIMUM_VIEWS."""
     if len(views) < MINIMUM_VIEWS:
         why = "".join(f"; {r.id}: {r.reason}" for r in rejected[:5])
-        raise SolveError(
-            f"{len(views)} usable views of the board; a camera needs at least {MINIMUM_VIEWS}, "
-            f"tilted in different ways{why}"
-        )
+        raise SolveError(f"{len(views)} usable {need}{why}")
 
 
 def _fit(
@@ -180,7 +179,10 @@ def _zhang(views: Sequence[View], image_size: tuple[int, int]) -> list[float]:
     """Focal length from the homographies (Z. Zhang, 2000), if they yield a sensible one."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    focal = float(cv2.initCameraMatrix2D(points, pixels, image_size, 1.0)[0, 0])
+    try:
+        focal = float(cv2.initCameraMatrix2D(points, pixels, image_size, 1.0)[0, 0])
+    except cv2.error:  # OpenCV finds no homography in single precision
+        return []
     return [focal] if 0.1 < focal / max(image_size) < 100.0 else []
 
 

@@ -33,9 +33,10 @@ from cellctl.geometry import Array, Mask, invert
 PINHOLE = (0, 1, 2, 3)
 FULL = tuple(range(9))
 """Free intrinsic parameters: places in camera.INTRINSICS."""
-SCALE_SIGMA, WARP_SIGMA = 0.005, 0.01
-"""How far prints are off before the data have been asked: scale, and lift at the edge of the
-board in half lengths."""
+SCALE_SIGMA, WARP_SIGMA = 0.1, 0.01
+"""How far boards are off before the data have been asked: scale, and lift at the edge of the
+board in half lengths. Printers scale by less than a percent; people mistake one board for
+another, and a prior that did not allow for it would bend the camera instead."""
 
 
 @dataclass(frozen=True, eq=False)

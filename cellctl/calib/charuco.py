@@ -8,13 +8,14 @@ pictures with small markers that finds up to six times as many.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
 from cellctl.calib.aruco import dictionary, find_markers
 from cellctl.calib.corners import REACH, Grey, refine_crossings, sample
-from cellctl.calib.printed import lattice
+from cellctl.calib.printed import Unseen, lattice
 from cellctl.calib.projector_map import apply_homography, direct_linear_transform
 from cellctl.geometry import Array, Mask
 
@@ -23,6 +24,14 @@ NEAREST = 4
 """Markers that predict a crossing: few enough that lens distortion hardly matters."""
 OUTLIER = 0.5
 """A marker is false when it lies so many squares from where the others have it."""
+ELSEWHERE, CONTRADICTED, CONTRADICTING = 0.8, 0.2, 3
+"""A board is not the one stated when more than this part of its markers, and so many at least, lie
+so many squares away: more than a lens bends them, less than another board does."""
+ALMOST_ALL = 0.9
+OTHER_PATTERN = (
+    "its markers are where the other pattern for even numbers of rows has them: the board's "
+    "legacy is stated wrong"
+)
 MOVED = 0.2
 """Refinement may move a crossing by that many squares."""
 LEAST_PX = 2.5
@@ -33,12 +42,14 @@ LIKENESS, LIKENESS_STEPS = 0.7, 6
 class CharucoLayout:
     """`corners` (n, 2) of the crossings and `markers` {id: corners (4, 2)}, both on the board in
     metres; side of a square and of a marker; name of the dictionary; modules of a marker's side.
+    `rivals` are the markers where the other value of `legacy` has them.
     `signs` (n,): 1 where the squares above right and below left of a crossing are dark, else -1.
     """
 
     corners: Array
     signs: Array
     markers: dict[int, Array]
+    rivals: dict[int, Array]
     square_m: float
     marker_m: float
     dictionary: str
@@ -75,19 +86,13 @@ class CharucoLayout:
         (before 4.6, white for even numbers of rows)."""
         columns, rows = squares
         first_white = legacy and rows % 2 == 0
-        gap = (square_m - marker_m) / 2
-        corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * marker_m + gap
         crossings = lattice((columns - 1, rows - 1), 1.0)[:, :2]
-        white = [
-            np.array([column, row]) * square_m + corner
-            for row in range(rows)
-            for column in range(columns)
-            if (row + column) % 2 != int(first_white)
-        ]
+        other_white = not legacy and rows % 2 == 0
         return cls(
             corners=crossings * square_m + square_m,
             signs=np.where((crossings.sum(axis=1) + first_white) % 2, 1.0, -1.0),
-            markers=dict(enumerate(white)),
+            markers=_places(squares, square_m, marker_m, first_white=first_white),
+            rivals=_places(squares, square_m, marker_m, first_white=other_white),
             square_m=square_m,
             marker_m=marker_m,
             dictionary=dictionary_name,
@@ -95,53 +100,95 @@ class CharucoLayout:
         )
 
 
-def find_charuco(image: Grey, layout: CharucoLayout) -> tuple[Array, Array] | None:
-    """Numbers (n,) and pixels (n, 2) of the crossings seen, or None without markers."""
-    places, pixels = _markers(image, layout)
+def _places(
+    squares: tuple[int, int], square_m: float, marker_m: float, *, first_white: bool
+) -> dict[int, Array]:
+    """Corners (4, 2) of the markers by number, board metres."""
+    columns, rows = squares
+    gap = (square_m - marker_m) / 2
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * marker_m + gap
+    white = [
+        np.array([column, row]) * square_m + corner
+        for row in range(rows)
+        for column in range(columns)
+        if (row + column) % 2 != int(first_white)
+    ]
+    return dict(enumerate(white))
+
+
+def find_charuco(image: Grey, layout: CharucoLayout) -> tuple[Array, Array] | Unseen:
+    """Numbers (n,) and pixels (n, 2) of the crossings seen, or why there are none."""
+    markers = _markers(image, layout)
+    if isinstance(markers, Unseen):
+        return markers
+    places, pixels = markers
     if len(places) < MINIMUM_MARKERS:
-        return None
-    square = layout.square_m * _scale(places, pixels)
+        return Unseen()
+    square = layout.square_m * float(_scales(places, pixels).min())
     predicted, axes = _predict(layout, places, pixels)
     numbers = np.flatnonzero(_inside(predicted, image, 0.5 * square))
     if not len(numbers):
-        return None
+        return Unseen()
     refined = refine_crossings(image, predicted[numbers], axes[numbers], layout.reach(square))
     moved = np.linalg.norm(refined - predicted[numbers], axis=1)
     around = axes[numbers] * layout.gap
     likeness = _likeness(image, refined, around, layout.signs[numbers])
     seen = (moved < MOVED * square) & (likeness > LIKENESS)
-    return (numbers[seen], refined[seen]) if seen.any() else None
+    return (numbers[seen], refined[seen]) if seen.any() else Unseen()
 
 
-def _markers(image: Grey, layout: CharucoLayout) -> tuple[Array, Array]:
+def _markers(image: Grey, layout: CharucoLayout) -> tuple[Array, Array] | Unseen:
     """Board metres and pixels (m, 4, 2) of the markers that agree with each other."""
     found = find_markers(image, layout.dictionary, precise=False)
     known = [k for k, number in enumerate(found.ids) if int(number) in layout.markers]
+    if len(known) < MINIMUM_MARKERS:
+        return Unseen()
     places = np.array([layout.markers[int(found.ids[k])] for k in known]).reshape(-1, 4, 2)
     pixels = found.corners[known].reshape(-1, 4, 2)
-    if len(places) > MINIMUM_MARKERS:
-        H, _ = cv2.findHomography(
-            places.reshape(-1, 2),
-            pixels.reshape(-1, 2),
-            cv2.RANSAC,
-            _tolerance(layout, places, pixels),
-        )
-        if H is not None:
-            off = np.linalg.norm(apply_homography(H, places) - pixels, axis=-1).max(axis=-1)
-            keep = off < _tolerance(layout, places, pixels)
-            places, pixels = places[keep], pixels[keep]
-    return places, pixels
+    off = _off(places, pixels, layout.square_m)
+    wrong = off > ELSEWHERE
+    if wrong.any() and (reason := _contradiction(layout, found.ids[known], pixels, off)):
+        return Unseen(reason)
+    return places[off < OUTLIER], pixels[off < OUTLIER]
 
 
-def _tolerance(layout: CharucoLayout, places: Array, pixels: Array) -> float:
-    return OUTLIER * layout.square_m * _scale(places, pixels)
+def _contradiction(layout: CharucoLayout, ids: Array, pixels: Array, off: Array) -> str:
+    """Why the board is not the one stated, empty when only single markers (m,) are false; `off`
+    is how far each is from its place, squares."""
+    wrong = off > ELSEWHERE
+    rival = np.array([layout.rivals[int(number)] for number in ids])
+    share = float(np.mean(_off(rival, pixels, layout.square_m) < OUTLIER))
+    if share > max(ALMOST_ALL, float(np.mean(off < OUTLIER))):
+        return OTHER_PATTERN
+    if np.count_nonzero(wrong) < CONTRADICTING or wrong.mean() <= CONTRADICTED:
+        return ""
+    names = ", ".join(str(number) for number in ids[wrong][:8])
+    return (
+        f"{np.count_nonzero(wrong)} of {len(ids)} markers are not where the board should have "
+        f"them (numbers {names}): check its squares, its dictionary and legacy"
+    )
 
 
-def _scale(places: Array, pixels: Array) -> float:
-    """Pixels per metre where, and in the direction in which, the board is smallest."""
+def _off(places: Array, pixels: Array, square_m: float) -> Array:
+    """How many squares (m,) each marker's pixels (m, 4, 2) lie from where the others have its
+    place (m, 4, 2) on the board; zero where too few are seen to tell. A square is that of the
+    median marker: the smallest one may be false."""
+    square = square_m * float(np.median(_scales(places, pixels)))
+    if len(places) <= MINIMUM_MARKERS:
+        return np.zeros(len(places))
+    ends = places.reshape(-1, 2), pixels.reshape(-1, 2)
+    H: Any = cv2.findHomography(*ends, cv2.RANSAC, OUTLIER * square)[0]
+    if H is None:
+        return np.zeros(len(places))
+    off = np.linalg.norm(apply_homography(H, places) - pixels, axis=-1)
+    return np.asarray(off.max(axis=-1) / square)
+
+
+def _scales(places: Array, pixels: Array) -> Array:
+    """Pixels per metre (m,) of each marker in the direction in which it is smallest."""
     side = np.linalg.norm(places[0, 1] - places[0, 0])
     sides = np.stack([pixels[:, 1] - pixels[:, 0], pixels[:, 3] - pixels[:, 0]], axis=-1)
-    return float(np.linalg.svd(sides, compute_uv=False).min() / side)
+    return np.asarray(np.linalg.svd(sides, compute_uv=False)[:, -1] / side)
 
 
 def _predict(layout: CharucoLayout, places: Array, pixels: Array) -> tuple[Array, Array]:

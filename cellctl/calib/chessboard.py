@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cellctl.calib.beyond import print_goes_on
 from cellctl.calib.corners import (
     Grey,
     cross,
@@ -23,6 +24,7 @@ from cellctl.calib.corners import (
     saddle_strength,
     sample,
 )
+from cellctl.calib.printed import Unseen
 from cellctl.calib.projector_map import apply_homography, direct_linear_transform
 from cellctl.geometry import Array
 
@@ -35,19 +37,24 @@ STRAY = 0.4
 """How far corners may be from a plane's picture, in distances between neighbours."""
 MOVED_PX, MOVED = 2.5, 0.05
 """How far refinement may move a corner: pixels of the reduced picture, and of the spacing."""
+GOES_ON = "the chessboard goes on beyond {}x{} inner corners: count the board's inner corners"
 
 
-def find_chessboard(image: Grey, inner_corners: tuple[int, int]) -> Array | None:
-    """Corners (n, 2) in pixels, row by row, or None when the whole board is not in sight."""
+def find_chessboard(image: Grey, inner_corners: tuple[int, int]) -> Array | Unseen:
+    """Corners (n, 2) in pixels, row by row, or why the whole board is not in sight."""
+    why = Unseen()
     for finder in (_quick, _thorough):
         rough = finder(image, inner_corners)
         if rough is None:
             continue
         grid = _oriented(image, rough)
         pixels = None if grid is None else _refined(image, grid)
-        if pixels is not None:
+        if grid is None or pixels is None:
+            continue
+        if not print_goes_on(image, pixels.reshape(grid.shape), alternating=True):
             return pixels
-    return None
+        why = Unseen(GOES_ON.format(*inner_corners))
+    return why
 
 
 def _quick(image: Grey, inner_corners: tuple[int, int]) -> Array | None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from math import comb
 
 import cv2
 import numpy as np
@@ -120,12 +121,16 @@ def robust_start(A: Array, C: Array) -> tuple[Array, Array]:
 
 
 def _subsets(n: int) -> list[Array]:
+    """All views, and up to SUBSETS different choices of SUBSET_SIZE of them."""
     everything = [np.arange(n)]
     if n <= SUBSET_SIZE:
         return everything
-    every = list(combinations(range(n), SUBSET_SIZE))
-    chosen = np.random.default_rng(0).permutation(len(every))[:SUBSETS]
-    return everything + [np.array(every[i]) for i in sorted(chosen)]
+    if comb(n, SUBSET_SIZE) <= SUBSETS:
+        return everything + [np.array(one) for one in combinations(range(n), SUBSET_SIZE)]
+    rng, chosen = np.random.default_rng(0), set[tuple[int, ...]]()
+    while len(chosen) < SUBSETS:
+        chosen.add(tuple(sorted(rng.choice(n, SUBSET_SIZE, replace=False).tolist())))
+    return everything + [np.array(one) for one in sorted(chosen)]
 
 
 def consistent_options(A: Array, options: Sequence[Array]) -> list[int]:

@@ -13,16 +13,18 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cellctl.calib.beyond import print_goes_on
 from cellctl.calib.corners import Grey, cross, sample
-from cellctl.calib.printed import lattice, neighbours
+from cellctl.calib.printed import Unseen, lattice, neighbours
 from cellctl.calib.projector_map import apply_homography, direct_linear_transform
 from cellctl.geometry import Array
 
 STEPS = 40
+GOES_ON = "the grid goes on beyond {}x{} dots: count the board's dots"
 
 
-def find_dots(image: Grey, counts: tuple[int, int]) -> Array | None:
-    """Centres (n, 2) in pixels, row by row, right-handed; None when not all are in sight.
+def find_dots(image: Grey, counts: tuple[int, int]) -> Array | Unseen:
+    """Centres (n, 2) in pixels, row by row, right-handed; or why not all are in sight.
 
     Nothing tells one end of a plain grid from the other: the first dot is the one from which
     the finder happens to begin.
@@ -31,10 +33,12 @@ def find_dots(image: Grey, counts: tuple[int, int]) -> Array | None:
     flags = cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
     found, centres = cv2.findCirclesGrid(image, counts, flags=flags, blobDetector=_blobs(w * h))
     if not found or centres is None:
-        return None
+        return Unseen()
     grid = np.asarray(centres, dtype=float).reshape(counts[1], counts[0], 2)
     if cross(grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]) < 0:
         grid = grid[:, ::-1]
+    if print_goes_on(image, grid, alternating=False):
+        return Unseen(GOES_ON.format(*counts))
     return _without_perspective(image, grid.reshape(-1, 2), counts)
 
 

@@ -13,7 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
-from cellctl.calib.camera_fit import CameraOption, fit_camera, usable_views
+from cellctl.calib.camera_fit import (
+    MINIMUM_POINTS,
+    MINIMUM_VIEWS,
+    CameraFit,
+    require_views,
+    usable_views,
+)
 from cellctl.calib.chain import ChainState, Free
 from cellctl.calib.closed_form import (
     axis_scatter_deg,
@@ -37,6 +43,7 @@ from cellctl.calib.hand_eye_fit import (
     possible_poses,
 )
 from cellctl.calib.hand_eye_result import HandEyeLimits, HandEyeResult, HandEyeView, judge
+from cellctl.calib.intrinsic import best_camera
 from cellctl.calib.pose import pose_vectors
 from cellctl.calib.schur import minimise
 from cellctl.calib.views import Rejection, RobotView, noise_px, ordered, rms
@@ -45,10 +52,10 @@ from cellctl.geometry import Array, Transform, invert, rotation_angle, transform
 
 __all__ = ["HandEyeLimits", "HandEyeResult", "HandEyeView", "PosePriors", "judge", "solve_hand_eye"]
 
-MINIMUM_VIEWS = 3
-MINIMUM_POINTS = 6
-BENT_VIEWS = 6
-"""From so many views on, a camera calibrated from them allows for a bent board."""
+NEED = (
+    f"views with robot poses; hand-eye needs at least {MINIMUM_VIEWS}, turned about at least two "
+    "axes"
+)
 GROSS_M, GROSS_RAD, GROSS_MEDIANS = 0.02, np.radians(2.0), 5.0
 """Before any fit is believed a view may be off by that much, and that many times the median."""
 STRAIN_SIGMAS, STRAIN_FACTOR = 4.0, 3.0
@@ -75,22 +82,13 @@ def solve_hand_eye(
     """
     every = ordered(views)
     usable, rejected = usable_views(every, minimum_points)
-    _require(usable, rejected)
-    job, disagreeing = _job(usable, mount, camera, image_size, priors)
+    require_views(usable, rejected, NEED)
+    job, disagreeing = _job(usable, mount, camera, image_size, priors, minimum_points)
     job, strained = _without_strained(job)
     rejected = sorted([*rejected, *disagreeing, *strained], key=lambda r: r.id)
-    _require(job.data.views, rejected)
+    require_views(job.data.views, rejected, NEED)
     result = _result(job, every, _candidates(job), board)
     return replace(result, rejected=tuple(rejected))
-
-
-def _require(views: Sequence[RobotView], rejected: Sequence[Rejection]) -> None:
-    if len(views) < MINIMUM_VIEWS:
-        why = "".join(f"; {r.id}: {r.reason}" for r in rejected[:5])
-        raise SolveError(
-            f"{len(views)} usable views with robot poses; hand-eye needs at least "
-            f"{MINIMUM_VIEWS}, turned about at least two axes{why}"
-        )
 
 
 def _job(
@@ -99,25 +97,50 @@ def _job(
     camera: CameraModel | None,
     image_size: tuple[int, int] | None,
     priors: PosePriors,
+    minimum_points: int,
 ) -> tuple[Job, list[Rejection]]:
     """Camera, poses of the board in it, orientation of the board, start; gross errors out."""
-    fit, warp = None, np.zeros(3)
-    rejected: list[Rejection] = []
-    if camera is None:
-        if image_size is None:
-            raise SolveError("a camera or the size of the pictures is needed")
-        fit, rejected = fit_camera(views, image_size, CameraOption(warp=len(views) >= BENT_VIEWS))
-        views = [view for view in views if view.id in fit.names]
+    if camera is not None:
+        fit, rejected, warp = None, list[Rejection](), np.zeros(3)
+        found, lost = possible_poses(views, camera)
+    else:
+        fit, rejected = _camera_of(views, image_size, minimum_points)
+        fit, found, lost = located(views, fit)
         camera, warp = fit.camera, fit.state.warp
-    found, lost = possible_poses(views, camera)
-    _require([view for view in views if view.id in found], [*rejected, *lost])
+    rejected = [*rejected, *lost]
+    require_views([view for view in views if view.id in found], rejected, NEED)
     views, boards, noise = _oriented(list(found.values()), mount, camera)
     data = RobotData.of(views, mount)
     X, Y = robust_start(data.reported, boards)
     start = ChainState(camera, X, Y, data.no_corrections, warp=warp)
     noise = fit.sigma_px if fit else noise
     job, gross = _without_gross(Job(data, boards, start, Noise(noise, ROBOT_SIGMA), priors, fit))
-    return estimate_noise(job), [*rejected, *lost, *gross]
+    return estimate_noise(job), [*rejected, *gross]
+
+
+def _camera_of(
+    views: list[RobotView], image_size: tuple[int, int] | None, minimum_points: int
+) -> tuple[CameraFit, list[Rejection]]:
+    """A camera from the hand-eye views themselves."""
+    if image_size is None:
+        raise SolveError("a camera or the size of the pictures is needed")
+    best = best_camera(views, image_size, minimum_points=minimum_points)
+    return best.fit, best.rejected
+
+
+def located(
+    views: list[RobotView], fit: CameraFit
+) -> tuple[CameraFit, dict[str, Possible], list[Rejection]]:
+    """What the pictures allow under a camera that came from them. A view that has no pose under
+    it is lost to the camera too, which may cost another view its pose."""
+    lost: list[Rejection] = []
+    while True:
+        used = [view for view in views if view.id in fit.names]
+        found, more = possible_poses(used, fit.camera)
+        lost += more
+        if not more or len(found) < MINIMUM_VIEWS:
+            return fit, found, lost
+        fit = fit.over(np.isin(fit.names, list(found)))
 
 
 def _oriented(

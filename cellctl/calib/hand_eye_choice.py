@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cellctl.calib.camera import CameraModel
 from cellctl.calib.chain import ChainState
 from cellctl.calib.hand_eye_fit import Job, Option, RobotData, fit
-from cellctl.calib.pose import BoardPose, board_poses
-from cellctl.calib.views import excess, rms
+from cellctl.calib.pose import board_poses
+from cellctl.calib.views import RobotView, excess, rms
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, invert, rotation_angle
 
@@ -50,15 +51,20 @@ def _fold(job: Job, view: int) -> Fold:
     if rest.camera_fit is not None:
         camera = rest.start.camera
         boards = [
-            _nearest(board_poses(one, camera), before)
+            _nearest(one, camera, before)
             for one, before in zip(rest.data.views, rest.boards, strict=True)
         ]
         rest = replace(rest, boards=np.stack(boards))
     return Fold(job.data.subset([view]), kept, rest)
 
 
-def _nearest(poses: Sequence[BoardPose], before: Array) -> Array:
-    """Of the two poses that a picture allows, the one that was chosen before."""
+def _nearest(view: RobotView, camera: CameraModel, before: Array) -> Array:
+    """Of the two poses that a picture allows, the one that was chosen before; which stays if the
+    camera of this fold allows none."""
+    try:
+        poses = board_poses(view, camera)
+    except SolveError:
+        return before
     return min((pose.matrix for pose in poses), key=lambda m: rotation_angle(invert(before) @ m))
 
 

@@ -105,13 +105,14 @@ class HandEyeResult:
 @dataclass(frozen=True)
 class HandEyeLimits:
     """What hand-eye must reach to pass. The scatter of rotation axes: its smallest and its
-    second value, degrees."""
+    second value, degrees. `scale`: by how much a board may differ from its stated size."""
 
     views: int = 5
     held_out_px: float = 3.0
     scatter_deg: tuple[float, float] = (10.0, 20.0)
     rejected: float = 1.0 / 3.0
     spread_mm: float = 5.0
+    scale: float = 0.01
 
 
 def judge(
@@ -120,19 +121,25 @@ def judge(
     """("pass" or "fail", reasons in words); a pass has no reasons."""
     limits = limits or HandEyeLimits()
     used, total = len(result.views), len(result.views) + len(result.rejected)
-    smallest, second, _ = result.axis_scatter_deg
     reasons = []
     if used < limits.views:
         reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
     if total - used > limits.rejected * total:
         reasons.append(f"{total - used} of {total} views were rejected")
+    smallest, second, largest = result.axis_scatter_deg
     if smallest < limits.scatter_deg[0] or second < limits.scatter_deg[1]:
         reasons.append(
-            f"the flange turned by {smallest:.0f}, {second:.0f} and "
-            f"{result.axis_scatter_deg[2]:.0f} degrees about three axes; at least "
-            f"{limits.scatter_deg[0]:.0f} and {limits.scatter_deg[1]:.0f} are needed about the "
-            "weaker two: add views tilted about other axes"
+            f"the flange turned by {smallest:.0f}, {second:.0f} and {largest:.0f} degrees about "
+            f"three axes; at least {limits.scatter_deg[0]:.0f} and {limits.scatter_deg[1]:.0f} "
+            "are needed about the weaker two: add views tilted about other axes"
         )
+    reasons += _errors(result, limits)
+    return ("fail" if reasons else "pass"), tuple(reasons)
+
+
+def _errors(result: HandEyeResult, limits: HandEyeLimits) -> list[str]:
+    """What pictures, robot and board say against each other, beyond the limits."""
+    reasons = []
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
@@ -144,4 +151,10 @@ def judge(
             f"pictures and robot disagree about the board by {spread:.1f} mm, over the limit of "
             f"{limits.spread_mm} mm"
         )
-    return ("fail" if reasons else "pass"), tuple(reasons)
+    if not abs(result.scale - 1.0) <= limits.scale:
+        way = "smaller" if result.scale < 1.0 else "larger"
+        reasons.append(
+            f"the board is {100 * abs(result.scale - 1.0):.1f} % {way} than stated, by the "
+            "robot's measure: measure the board"
+        )
+    return reasons

@@ -87,9 +87,10 @@ def judge(
         reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
     if total - used > limits.rejected * total:
         reasons.append(f"{total - used} of {total} views were rejected")
-    if not result.held_out_px <= limits.held_out_px:
+    if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
-            f"held-out error {result.held_out_px:.2f} px, over the limit of {limits.held_out_px} px"
+            f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
+            f"{limits.held_out_px} px"
         )
     focal_sigma = float(np.max(result.sigma[:2] / result.camera.vector[:2]))
     if not focal_sigma <= limits.focal_sigma:
@@ -111,8 +112,8 @@ def _missing_tilt(result: IntrinsicResult, focal_sigma: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Attempt:
-    """A fit and how it predicts: held-out errors (k, 2) of every view by its id."""
+class CameraAttempt:
+    """A fit, and how it predicts: held-out errors (k, 2) of every view by its id."""
 
     fit: CameraFit
     rejected: list[Rejection]
@@ -133,20 +134,29 @@ def solve_intrinsic(
     the held-out error decide. Bad views are rejected with a reason. SolveError names what is
     missing when fewer than three views are left.
     """
-    every = ordered(views)
     options = [CameraOption(distortion, bent) for bent in (False, True) if warp in (None, bent)]
-    attempts = [_attempt(every, image_size, option, minimum_points) for option in options]
-    return _result(_choose(attempts), image_size)
+    return _result(best_camera(ordered(views), image_size, options, minimum_points), image_size)
+
+
+def best_camera(
+    views: Sequence[View],
+    image_size: tuple[int, int],
+    options: Sequence[CameraOption] = (CameraOption(warp=False), CameraOption(warp=True)),
+    minimum_points: int = MINIMUM_POINTS,
+) -> CameraAttempt:
+    """The first of `options`, simplest first, that predicts views it has not seen as well as the
+    best does. SolveError as `solve_intrinsic`."""
+    return _choose([_attempt(views, image_size, option, minimum_points) for option in options])
 
 
 def _attempt(
     views: Sequence[View], image_size: tuple[int, int], option: CameraOption, minimum_points: int
-) -> _Attempt:
+) -> CameraAttempt:
     fit, rejected = fit_camera(views, image_size, option, minimum_points)
-    return _Attempt(fit, rejected, {view.id: _held_out(view, fit) for view in views})
+    return CameraAttempt(fit, rejected, {view.id: _held_out(view, fit) for view in views})
 
 
-def _choose(attempts: Sequence[_Attempt]) -> _Attempt:
+def _choose(attempts: Sequence[CameraAttempt]) -> CameraAttempt:
     """The simplest that is as good as the best, see `excess`."""
     errors = [list(attempt.held_out.values()) for attempt in attempts]
     best = min(errors, key=lambda views: rms(np.concatenate(views)))
@@ -169,7 +179,7 @@ def _held_out(view: View, fit: CameraFit) -> Array:
     return chain.errors(minimise(chain, state).state)[0]
 
 
-def _result(attempt: _Attempt, image_size: tuple[int, int]) -> IntrinsicResult:
+def _result(attempt: CameraAttempt, image_size: tuple[int, int]) -> IntrinsicResult:
     fit, held_out = attempt.fit, attempt.held_out
     errors, seen, poses = fit.chain.errors(fit.state), fit.chain.batch.seen, fit.state.corrections
     return IntrinsicResult(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,15 @@ TYPE_NAMES = {
     "Dots": "dots",
 }
 LARGEST_COUNT = 100
-LARGEST_M = 10.0
+LEAST_M, LARGEST_M = 1e-4, 10.0
+NOT_FOUND = "the board was not found in the picture"
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Why a picture does not show a board, in words."""
+
+    reason: str = NOT_FOUND
 
 
 def lattice(counts: tuple[int, int], step: float) -> Array:
@@ -92,9 +100,9 @@ def check_counts(board: Any, key: str, least: int) -> None:
 def check_length(board: Any, key: str) -> None:
     value = getattr(board, key)
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not 0.0 < value <= LARGEST_M:
+    if not number or not LEAST_M <= value <= LARGEST_M:
         raise BadInput(
-            f"{key} must be a length in metres, above 0 and up to {LARGEST_M:g}, not {value!r}"
+            f"{key} must be a length in metres, from {LEAST_M:g} to {LARGEST_M:g}, not {value!r}"
         )
 
 

@@ -19,10 +19,10 @@ TOO_BLURRED_PX = 3.0
 
 
 def sharpness(image: Any, detection: Detection) -> float:
-    """Width in pixels over which the board's printed edges rise from 10 to 90 %, on average.
+    """Width in pixels over which the board's printed edges rise from 10 to 90 %: their median.
 
-    As OpenCV's `estimateChessboardSharpness`, for any board. A lens in focus gives about 2 px;
-    see TOO_BLURRED_PX. Infinite when no edge can be measured.
+    As OpenCV's `estimateChessboardSharpness`, for any board, and though half of it be covered. A
+    lens in focus gives about 2 px; see TOO_BLURRED_PX. Infinite when no edge can be measured.
     """
     H = direct_linear_transform(detection.points[:, :2], detection.pixels)
     ends = apply_homography(H, detection.profiles)
@@ -35,7 +35,7 @@ def sharpness(image: Any, detection: Detection) -> float:
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     widths = _rise(values) * lengths
     clear = np.isfinite(widths)
-    return float(widths[clear].mean()) if clear.any() else float("inf")
+    return float(np.median(widths[clear])) if clear.any() else float("inf")
 
 
 def _rise(values: Array) -> Array:

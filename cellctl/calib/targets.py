@@ -7,6 +7,7 @@ corner of their first square or marker.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
@@ -19,6 +20,7 @@ from cellctl.calib.chessboard import find_chessboard
 from cellctl.calib.corners import grey
 from cellctl.calib.dots import find_dots
 from cellctl.calib.printed import (
+    Unseen,
     across_borders,
     check_counts,
     check_ids,
@@ -50,8 +52,12 @@ class Board(Protocol):
 
     minimum_points: ClassVar[int]
 
+    def look(self, image: Any) -> Detection | Unseen:
+        """The board in a grey or BGR uint8 picture, or why it is not seen there."""
+        ...
+
     def detect(self, image: Any) -> Detection | None:
-        """The board in a grey or BGR uint8 picture; None when it is not seen."""
+        """As `look`, None when it is not seen."""
         ...
 
     def extent(self) -> tuple[Array, Array]:
@@ -74,8 +80,22 @@ class Board(Protocol):
         ...
 
 
+class _Printed(ABC):
+    """What all boards do alike."""
+
+    @abstractmethod
+    def look(self, image: Any) -> Detection | Unseen: ...
+
+    def detect(self, image: Any) -> Detection | None:
+        found = self.look(image)
+        return found if isinstance(found, Detection) else None
+
+    def to_dict(self) -> dict[str, Any]:
+        return to_dict(self)
+
+
 @dataclass(frozen=True)
-class Chessboard:
+class Chessboard(_Printed):
     """`inner_corners` along x and y. The square outside the first inner corner, towards -x and
     -y, is dark: that fixes the orientation of boards with one odd and one even count."""
 
@@ -110,20 +130,15 @@ class Chessboard:
     def extent(self) -> tuple[Array, Array]:
         return np.full(2, -self.square_m), np.array(self.inner_corners) * self.square_m
 
-    def detect(self, image: Any) -> Detection | None:
+    def look(self, image: Any) -> Detection | Unseen:
         pixels = find_chessboard(grey(image), self.inner_corners)
-        return (
-            None
-            if pixels is None
-            else Detection(np.arange(len(pixels)), pixels, self.points, self.profiles)
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        return to_dict(self)
+        if isinstance(pixels, Unseen):
+            return pixels
+        return Detection(np.arange(len(pixels)), pixels, self.points, self.profiles)
 
 
 @dataclass(frozen=True)
-class Charuco:
+class Charuco(_Printed):
     """A chessboard of `squares` along x and y with ArUco markers in its white squares.
     `legacy` is the pattern of OpenCV before 4.6, which differs for even numbers of rows."""
 
@@ -168,19 +183,16 @@ class Charuco:
     def extent(self) -> tuple[Array, Array]:
         return np.zeros(2), np.array(self.squares) * self.square_m
 
-    def detect(self, image: Any) -> Detection | None:
+    def look(self, image: Any) -> Detection | Unseen:
         found = find_charuco(grey(image), self.layout)
-        if found is None:
-            return None
+        if isinstance(found, Unseen):
+            return found
         numbers, pixels = found
         return Detection(numbers, pixels, self.points[numbers], self.profiles)
 
-    def to_dict(self) -> dict[str, Any]:
-        return to_dict(self)
-
 
 @dataclass(frozen=True)
-class ArucoGrid:
+class ArucoGrid(_Printed):
     """`markers` along x and y, numbered row by row from `first_id`; `pitch_m` from one marker's
     corner to the next one's. Its points are the markers' corners, four a marker, clockwise."""
 
@@ -220,21 +232,18 @@ class ArucoGrid:
     def extent(self) -> tuple[Array, Array]:
         return np.zeros(2), (np.array(self.markers) - 1) * self.pitch_m + self.marker_m
 
-    def detect(self, image: Any) -> Detection | None:
+    def look(self, image: Any) -> Detection | Unseen:
         found = find_markers(grey(image), self.dictionary)
         numbers = found.ids - self.first_id
         own = (numbers >= 0) & (numbers < self.markers[0] * self.markers[1])
         if not own.any():
-            return None
+            return Unseen()
         ids = (4 * numbers[own][:, None] + np.arange(4)).reshape(-1)
         return Detection(ids, found.corners[own].reshape(-1, 2), self.points[ids], self.profiles)
 
-    def to_dict(self) -> dict[str, Any]:
-        return to_dict(self)
-
 
 @dataclass(frozen=True)
-class Dots:
+class Dots(_Printed):
     """A regular `grid` of dark dots along x and y, `spacing_m` from centre to centre.
 
     Perspective moves a dot's centre of gravity off its centre; that is corrected, lens
@@ -268,16 +277,11 @@ class Dots:
         half = self.spacing_m / 2
         return np.full(2, -half), np.array(self.grid) * self.spacing_m - half
 
-    def detect(self, image: Any) -> Detection | None:
+    def look(self, image: Any) -> Detection | Unseen:
         pixels = find_dots(grey(image), self.grid)
-        return (
-            None
-            if pixels is None
-            else Detection(np.arange(len(pixels)), pixels, self.points, self.profiles)
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        return to_dict(self)
+        if isinstance(pixels, Unseen):
+            return pixels
+        return Detection(np.arange(len(pixels)), pixels, self.points, self.profiles)
 
 
 TYPES: dict[str, Any] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -55,12 +54,3 @@ def bounding(mask: Mask) -> Region:
     """The smallest region that holds all of `mask` (h, w)."""
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return Region(left, top, left + width, top + height)
-
-
-def union(regions: Iterable[Region]) -> Region:
-    """The smallest region that holds them all."""
-    sides = [(r.left, r.top, r.right, r.bottom) for r in regions if r]
-    if not sides:
-        return NOWHERE
-    lefts, tops, rights, bottoms = zip(*sides, strict=True)
-    return Region(min(lefts), min(tops), max(rights), max(bottoms))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cellctl.arms import JOINTS, ArmModel, arm
-from cellctl.geometry import Array, Transform, invert, look_down, pose_matrix
+from cellctl.geometry import Array, Transform, look_down, pose_matrix
 from cellctl.sim.lens import Lens
 from cellctl.sim.presets import BoardPreset, CameraPreset, Preset, ProjectorPreset, TablePreset
 
@@ -304,8 +304,3 @@ def scoring_grid(preset: Preset) -> Array:
     steps = np.linspace(-1.0, 1.0, 11)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     return centre + grid * half
-
-
-def relative(parent: Transform, child: Transform) -> Array:
-    """T_parent_child (4, 4) of two poses in the world."""
-    return invert(parent.matrix) @ child.matrix

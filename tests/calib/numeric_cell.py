@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,8 +13,10 @@ from cellctl.calib.patterns import marker_pictures
 from cellctl.calib.targets import ArucoGrid, Chessboard
 from cellctl.calib.views import RobotView
 from cellctl.geometry import Array, Transform, invert, pose_matrix
+from cellctl.sim.cell_config import cell_document
+from cellctl.sim.grid import Grid
 from cellctl.sim.presets import CR
-from cellctl.sim.truth import Rng, Truth, draw, score, scoring_grid
+from cellctl.sim.truth import Rng, Truth, draw
 
 CORNER_NOISE_PX = 0.07
 HOME = np.radians([-90.0, -110.0, 110.0, -90.0, -90.0, 0.0])
@@ -32,23 +33,20 @@ class NumericCell:
     pictures: list[dict[int, Array]]
     centres: dict[int, Array]
     factory: CameraModel
-    table_height: float
+    known: Grid
 
     def score(self, pixels: Array) -> dict[str, float]:
         """true_mm and true_px of the pixels (121, 2) sent for `grid`."""
-        return score(self.truth, self.grid[:, :2], self.joints, pixels)
+        return self.known.score(pixels, self.truth)
 
-    @cached_property
-    def joints(self) -> Array:
-        """Those (121, 6) at which the nominal pen stands on `grid`."""
-        poses = self.truth.drawing_pose(self.grid[:, :2], self.table_height)
-        return _joints(self.truth, poses)
+    @property
+    def table_height(self) -> float:
+        return self.known.height
 
     @property
     def grid(self) -> Array:
         """The world points (121, 3) that are scored, at the height that the robot knows."""
-        xy = scoring_grid(self.truth.preset)
-        return np.column_stack([xy, np.full(len(xy), self.table_height)])
+        return self.known.points
 
 
 def numeric_cell(seed: int, intrinsic: int = 30, hand_eye: int = 10) -> NumericCell:
@@ -64,18 +62,17 @@ def numeric_cell(seed: int, intrinsic: int = 30, hand_eye: int = 10) -> NumericC
         hand_eye=_views(truth, "markers", markers.points, hand_eye, rng),
         pictures=[_seen(truth, picture.centres, rng) for picture in pictures],
         centres={i: c for picture in pictures for i, c in picture.centres.items()},
-        factory=_factory(truth),
-        table_height=float(truth.table.pose.translation[2] + rng.choice((-1.0, 1.0)) * 0.3e-3),
+        factory=_factory(seed),
+        known=Grid(truth),
     )
 
 
-def _factory(truth: Truth) -> CameraModel:
-    lens, preset = truth.camera.lens, truth.preset.camera
-    vector = np.concatenate([lens.focal, lens.centre, lens.distortion])
-    vector[:2] *= 1.0 + preset.factory_focal_off
-    vector[2:4] += preset.factory_centre_off_px * np.array([1.0, -1.0]) / np.sqrt(2.0)
-    vector[4:] *= preset.factory_distortion_factor
-    return CameraModel.from_vector(vector, lens.size)
+def _factory(seed: int) -> CameraModel:
+    """The maker's values, as the simulated cell's config has them."""
+    camera = cell_document(CR, seed)["camera"]
+    (fx, fy), (cx, cy) = camera["factory"]["focal_px"], camera["factory"]["centre_px"]
+    vector = np.array([fx, fy, cx, cy, *camera["factory"]["distortion"]])
+    return CameraModel.from_vector(vector, tuple(camera["image_size_px"]))
 
 
 def _views(truth: Truth, name: str, points: Array, count: int, rng: Rng) -> list[RobotView]:
@@ -132,15 +129,3 @@ def _seen(truth: Truth, centres: dict[int, Array], rng: Rng) -> dict[int, Array]
     noisy = pixels + rng.normal(0.0, CORNER_NOISE_PX / 2, pixels.shape)
     inside = np.all((noisy > 5) & (noisy < np.array(truth.camera.lens.size) - 5), axis=1)
     return {i: p for i, p, ok in zip(ids, noisy, inside, strict=True) if ok}
-
-
-def _joints(truth: Truth, poses: Array) -> Array:
-    """One consistent branch of solutions, from one drawing pose to the next."""
-    starts = ik.random_starts(truth.nominal_arm, 32, 1)
-    for near in ik.solutions(truth.nominal_arm, poses[60:61], np.zeros(6), starts)[0]:
-        joints, converged = ik.refine(
-            truth.nominal_arm, poses, np.tile(near, (len(poses), 1)), iterations=80
-        )
-        if converged.all():
-            return joints
-    raise AssertionError("no branch of joint solutions reaches the whole grid")

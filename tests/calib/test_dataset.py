@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cellctl.calib.observe import NOT_FOUND, Observed, observe, observe_with_robot
 from cellctl.calib.targets import Chessboard
-from cellctl.dataset import load_dataset
-from cellctl.errors import BadInput, CellctlError
+from cellctl.calib.views import View
+from cellctl.dataset import load_dataset, read_picture
+from cellctl.errors import BadInput
+from cellctl.geometry import pose_matrix
 from cellctl.offline import solve_dataset
 from tests.calib.render import homography, picture
 
@@ -80,15 +85,17 @@ def test_the_order_of_the_views_does_not_matter(pictures):
 
 def test_a_picture_without_the_board_is_rejected_by_id(pictures):
     result = solve_dataset(write(pictures, document(images=("0", "1", "2", "3", "none"))))
-    assert result["views"]["rejected"] == [
-        {"id": "none", "reason": "the board was not found in the picture"}
-    ]
+    assert result["views"]["rejected"] == [{"id": "none", "reason": NOT_FOUND}]
 
 
 def test_notes_in_the_file_are_ignored(pictures):
     noted = document(note="taken on Monday")
     noted["views"][0]["light"] = "bright"
     assert load_dataset(write(pictures, noted)).board == BOARD
+
+
+def far(metres: float) -> list[list[float]]:
+    return pose_matrix((0.0, 0.0, 0.0), (metres, 0.0, 0.0)).tolist()
 
 
 VIEW = {"id": "0", "image": "images/0.png"}
@@ -131,9 +138,21 @@ VIEW = {"id": "0", "image": "images/0.png"}
             "view '0': T_base_flange is not rigid",
         ),
         (
-            document("hand-eye", intrinsic_images=["images/9.png"]),
-            "view '9': image .* does not exist",
+            document("hand-eye", views=[{**VIEW, "T_base_flange": far(1e9)}]),
+            r"view '0': T_base_flange is 1e\+09 m long; are these millimetres",
         ),
+        (
+            document("hand-eye", views=[{**VIEW, "T_base_flange": far(800)}]),
+            "view '0': T_base_flange is 800 m long; are these millimetres",
+        ),
+        (
+            document("hand-eye", intrinsic_images=["images/9.png"]),
+            "view 'images/9.png': image .* does not exist",
+        ),
+        (document("hand-eye", intrinsic_images=["."]), r"view '\.': image '\.' does not exist"),
+        (document("hand-eye", intrinsic_images=["/"]), "view '/': .*relative to the folder"),
+        (document("hand-eye", intrinsic_images=[""]), "intrinsic_images"),
+        (document(views=[{"id": "a", "image": "../x/0.png"}]), "view 'a': .*within it"),
     ],
 )
 def test_what_is_wrong_is_named(pictures, content, words):
@@ -162,16 +181,112 @@ def test_a_board_that_is_never_seen_is_named(pictures):
 
 
 def test_the_robot_must_have_turned(pictures):
-    """Every view at the same robot pose: no answer, and the reason in words."""
-    with pytest.raises(CellctlError, match="two different axes"):
-        solve_dataset(write(pictures, document("hand-eye")))
+    """Every view at the same robot pose: no answer, said as every answer is."""
+    result = solve_dataset(write(pictures, document("hand-eye", images=("0", "1", "2", "none"))))
+    assert (result["kind"], result["verdict"]) == ("hand-eye", "fail")
+    assert "two different axes" in result["reasons"][0]
+    assert result["views"]["used"] == []
+    assert [view["id"] for view in result["views"]["rejected"]] == ["none"]
+
+
+@pytest.mark.parametrize("kind", ["intrinsic", "hand-eye"])
+def test_too_few_views_fail_with_the_reason(pictures, kind):
+    result = solve_dataset(write(pictures, document(kind, images=("0", "1", "none"))))
+    assert result["verdict"] == "fail"
+    assert "2 usable views" in result["reasons"][0]
+    assert result["views"]["rejected"] == [{"id": "none", "reason": NOT_FOUND}]
+
+
+def test_pictures_without_the_board_count_in_the_verdict(pictures):
+    blanks = [{"id": f"blank{i}", "image": "images/none.png"} for i in range(3)]
+    content = document(images=("0", "1", "2", "3"))
+    content["views"] += blanks
+    result = solve_dataset(write(pictures, content))
+    assert "3 of 7 views were rejected" in result["reasons"]
+
+
+def turned(name: str, degrees: float) -> dict[str, Any]:
+    """A view whose file is that of `name`'s first letter, at a robot pose of its own."""
+    pose = pose_matrix(np.radians([degrees, 0.0, 0.0]), (0.0, 0.0, 0.5)).tolist()
+    return {"id": name, "image": f"images/{name[0]}.png", "T_base_flange": pose}
+
+
+def test_the_same_picture_twice_counts_once(pictures):
+    content = document()
+    content["views"].append({"id": "again", "image": "images/1.png"})
+    result = solve_dataset(write(pictures, content))
+    assert result["views"] == {
+        "used": ["0", "1", "2", "3"],
+        "rejected": [{"id": "again", "reason": "the same picture as view '1'"}],
+    }
+
+
+def test_the_same_picture_at_two_robot_poses_counts_not_at_all(pictures):
+    """Nothing tells which pose is its own; at the same pose it is a copy, and noise is none."""
+    views = [
+        turned("0", 0.0),
+        turned("1", 20.0),
+        turned("1b", 20.01),
+        turned("2", 0),
+        turned("2b", 9),
+    ]
+    dataset = load_dataset(write(pictures, document("hand-eye", views=views)))
+    seen = observe_with_robot(dataset.board, dataset.images_with_robot())
+    assert [view.id for view in seen.views] == ["0", "1"]
+    assert {r.id: r.reason for r in seen.unseen} == {
+        "1b": "the same picture as view '1'",
+        "2": "the same picture as view '2b' but at another robot pose: one of them is mislabelled",
+        "2b": "the same picture as view '2' but at another robot pose: one of them is mislabelled",
+    }
+
+
+def test_a_blurred_picture_is_rejected_unless_all_are(pictures):
+    def seen(*sigmas: float) -> Observed[View]:
+        sharp = [read_picture(pictures / f"images/{i}.png", SIZE, "") for i in range(len(sigmas))]
+        soft = [cv2.GaussianBlur(im, (0, 0), s) for im, s in zip(sharp, sigmas, strict=True)]
+        return observe(BOARD, [(str(i), np.asarray(image)) for i, image in enumerate(soft)])
+
+    one = seen(0.5, 0.5, 3.0, 0.5)
+    assert [view.id for view in one.views] == ["0", "1", "3"]
+    assert one.unseen[0].id == "2"
+    assert re.match(r"blurred: its edges are \d\.\d px wide", one.unseen[0].reason)
+    assert len(seen(2.4, 2.4, 3.0, 2.4).views) == 4
+
+
+def test_orientation_tags_do_not_turn_pictures(pictures, tmp_path):
+    """A phone held upright says so in the file; the sensor is as wide as ever."""
+    image = read_picture(pictures / "images/0.png", SIZE, "")
+    jpeg = bytes(cv2.imencode(".jpg", image)[1])
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "upright.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
+    obeyed = cv2.imread(str(tmp_path / "upright.jpg"))
+    assert obeyed is not None
+    assert obeyed.shape[:2] == (640, 480)
+    assert read_picture(tmp_path / "upright.jpg", SIZE, "here").shape == (480, 640)
+
+
+def test_intrinsic_pictures_may_share_a_name(pictures):
+    (pictures / "more").mkdir(exist_ok=True)
+    shutil.copy(pictures / "images/1.png", pictures / "more/0.png")
+    content = document("hand-eye", intrinsic_images=["images/0.png", "more/0.png"])
+    dataset = load_dataset(write(pictures, content))
+    assert [picture.id for picture in dataset.intrinsic_pictures] == ["images/0.png", "more/0.png"]
+
+
+def test_a_tiny_board_is_refused(pictures):
+    tiny = {**BOARD.to_dict(), "square_m": 1e-320}
+    with pytest.raises(BadInput, match=r"board: square_m .* in metres, from 0\.0001"):
+        load_dataset(write(pictures, document(board=tiny)))
 
 
 def test_intrinsic_pictures_of_another_shape_are_refused(pictures):
+    cropped = read_picture(pictures / "images/0.png", SIZE, "")[40:440]
+    cv2.imwrite(str(pictures / "images/cropped.png"), cropped)
     mixed = document(
         "hand-eye",
-        images=("small",),
-        image_size=[320, 200],
+        images=("cropped",),
+        image_size=[640, 400],
         intrinsic_images=[f"images/{i}.png" for i in range(4)],
         intrinsic_image_size=list(SIZE),
     )
@@ -179,7 +294,15 @@ def test_intrinsic_pictures_of_another_shape_are_refused(pictures):
         solve_dataset(write(pictures, mixed))
 
 
-leaves = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8)
+leaves = (
+    st.none()
+    | st.booleans()
+    | st.floats()
+    | st.integers()
+    | st.just(10**400)
+    | st.text(max_size=8)
+    | st.sampled_from([".", "/", "..", "../0.png"])
+)
 anything = st.recursive(
     leaves,
     lambda inner: (
@@ -201,7 +324,8 @@ anything = st.recursive(
 def test_any_value_anywhere_is_read_or_bad_input(pictures, kind, key, value, inside_a_view):
     content = document(kind)
     if inside_a_view:
-        content["views"][1] = {**content["views"][1], "T_base_flange": value, "id": value}
+        content["views"][1] = {**content["views"][1], "T_base_flange": value}
+        content["views"][2] = {**content["views"][2], "id": value}
     else:
         content[key] = value
     message = "dataset.json"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ import numpy as np
 import pytest
 
 from cellctl.calib.aruco import find_markers
+from cellctl.calib.beyond import print_goes_on
 from cellctl.calib.corners import refine_crossings
+from cellctl.calib.printed import NOT_FOUND, Unseen
 from cellctl.calib.sharpness import TOO_BLURRED_PX, sharpness
-from cellctl.calib.targets import ArucoGrid, Board, Charuco, Chessboard, Dots
+from cellctl.calib.targets import ArucoGrid, Board, Charuco, Chessboard, Detection, Dots
+from cellctl.dataset import load_dataset
 from cellctl.errors import BadInput
 from cellctl.geometry import Array, transform_points
 from tests.calib.render import homography, picture, truth
@@ -87,6 +91,18 @@ def test_marker_corners_beat_opencvs():
     assert centres.std() < 0.035
 
 
+def test_a_small_marker_does_not_spoil_the_others():
+    """One that belongs to something else, in a corner of the picture."""
+    image, _ = shot(GRID, 33.0)
+    alone = find_markers(image, "DICT_4X4_50")
+    image[10:60, 10:60] = 255
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image[25:43, 25:43] = cv2.aruco.generateImageMarker(family, 40, 18)
+    both = find_markers(image, "DICT_4X4_50")
+    assert both.ids.tolist() == [*alone.ids.tolist(), 40]
+    assert np.abs(both.corners[:-1] - alone.corners).max() < 1e-9
+
+
 @pytest.mark.parametrize("spin", [0.0, 90.0, 180.0, 270.0])
 @pytest.mark.parametrize("board", [CHESS, Chessboard((6, 9), 0.03)])
 def test_colours_tell_the_ends_of_a_chessboard_apart(board, spin):
@@ -129,9 +145,86 @@ def test_a_board_that_is_cut_off_is_not_found():
     assert CHESS.detect(cut) is None
 
 
-def test_another_board_is_not_taken_for_ours():
+def test_a_smaller_board_is_not_taken_for_ours():
     image, _ = shot(Chessboard((8, 5), 0.03), 0.0)
     assert CHESS.detect(image) is None
+
+
+@pytest.mark.parametrize("spin", [0.0, 90.0, 160.0])
+@pytest.mark.parametrize(
+    ("printed", "stated", "words"),
+    [
+        (CHESS, Chessboard((8, 6), 0.03), "goes on beyond 8x6 inner corners"),
+        (CHESS, Chessboard((9, 5), 0.03), "goes on beyond 9x5 inner corners"),
+        (DOTS, Dots((9, 6), 0.03), "goes on beyond 9x6 dots"),
+        (DOTS, Dots((8, 7), 0.03), "goes on beyond 8x7 dots"),
+    ],
+)
+def test_part_of_a_larger_board_is_not_taken_for_ours(printed, stated, words, spin):
+    """As far as OpenCV finds such a part at all; whatever it finds is refused."""
+    image, _ = shot(printed, spin)
+    found = stated.look(image)
+    assert isinstance(found, Unseen)
+    assert words in found.reason or found.reason == NOT_FOUND
+
+
+@pytest.mark.parametrize(("board", "alternating"), [(CHESS, True), (DOTS, False)])
+def test_the_print_ends_where_it_ends(board, alternating):
+    """Any part of a board goes on, the whole one does not, however tilted."""
+    for tilt in ((0.0, 0.0), (40.0, -30.0)):
+        image, H = shot(board, 20.0, tilt=tilt)
+        columns, rows = board.inner_corners if alternating else board.grid
+        grid = truth(board.points, H).reshape(rows, columns, 2)
+        assert not print_goes_on(image, grid, alternating=alternating)
+        for part in (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1], grid[1:-1, 1:-1]):
+            assert print_goes_on(image, part, alternating=alternating)
+
+
+@pytest.mark.parametrize("squares", [(6, 8), (9, 6)])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_other_pattern_of_charuco_boards_is_named(squares, legacy):
+    """With the wrong one most crossings look right, one square off."""
+    board = Charuco(squares, 0.025, 0.018, "DICT_5X5_100", legacy=legacy)
+    image, _ = shot(board, 30.0)
+    assert isinstance(board.look(image), Detection)
+    found = replace(board, legacy=not legacy).look(image)
+    assert isinstance(found, Unseen)
+    assert "legacy is stated wrong" in found.reason
+
+
+def test_a_charuco_board_of_other_squares_is_named():
+    image, _ = shot(CHARUCO, 30.0)
+    found = replace(CHARUCO, squares=(8, 5)).look(image)
+    assert isinstance(found, Unseen)
+    assert "markers are not where the board should have them" in found.reason
+
+
+def test_single_false_markers_do_not_spoil_a_board():
+    """Another board's marker in the picture, with a number that ours has: covered there, seen
+    elsewhere."""
+    image, H = shot(CHARUCO, 0.0, tilt=(0.0, 0.0))
+    place = truth(np.column_stack([CHARUCO.layout.markers[3], np.zeros(4)]), H)
+    low, high = place.min(axis=0).astype(int) - 2, place.max(axis=0).astype(int) + 3
+    image[low[1] : high[1], low[0] : high[0]] = 210
+    image[20:100, 20:100] = 255
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image[30:90, 30:90] = cv2.aruco.generateImageMarker(family, 3, 60)
+    found = CHARUCO.detect(image)
+    assert found is not None
+    assert len(found.ids) == len(CHARUCO.points)
+    assert np.abs(found.pixels - truth(found.points, H)).max() < 0.3
+
+
+def test_real_boards_that_are_mislabelled(shared_data: Path):
+    """A chessboard stated one column short, a ChArUco board with the other pattern: no picture."""
+    left = load_dataset(shared_data / "opencv_left_intr")
+    arm = load_dataset(shared_data / "ur_charuco_eih")
+    assert isinstance(left.board, Chessboard)
+    assert isinstance(arm.board, Charuco)
+    short = replace(left.board, inner_corners=(8, 6))
+    assert all(short.detect(image) is None for _, image in left.images())
+    other = replace(arm.board, legacy=not arm.board.legacy)
+    assert all(other.detect(image) is None for _, image in arm.images())
 
 
 def test_hidden_crossings_are_not_invented():

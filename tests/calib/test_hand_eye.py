@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cellctl.calib.camera_fit import CameraOption, fit_camera
 from cellctl.calib.closed_form import METHODS, axis_scatter_deg, closed_form, robust_start
-from cellctl.calib.hand_eye import HandEyeLimits, judge, solve_hand_eye
+from cellctl.calib.hand_eye import HandEyeLimits, judge, located, solve_hand_eye
 from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.hand_eye_fit import options
+from cellctl.calib.intrinsic import solve_intrinsic
 from cellctl.calib.targets import Chessboard
 from cellctl.calib.views import RobotView
 from cellctl.errors import SolveError
@@ -108,6 +111,21 @@ def test_a_wrong_board_size_is_found():
     assert off_mm(result.camera_pose, X) < 1.5
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("scale", [0.9, 0.95, 1.05])
+def test_another_board_than_stated_is_no_pass_and_does_not_bend_the_camera(mount, scale):
+    """The camera comes from the same views, so pictures alone would hide it."""
+    seen = robot_views(3, mount, scale=scale, count=9, robot=(0.2e-3, 0.02))
+    result = solve_hand_eye(seen, mount, image_size=SIZE)
+    verdict, reasons = judge(result)
+    assert verdict == "fail"
+    way = "smaller" if scale < 1 else "larger"
+    assert [reason for reason in reasons if f"% {way} than stated" in reason] == list(reasons)
+    assert result.scale == pytest.approx(scale, abs=3e-3)
+    assert np.abs(result.camera.vector[:2] - CAMERA.vector[:2]).max() < 5
+    assert off_mm(result.camera_pose, X) < 5
+
+
 def test_the_camera_may_come_from_the_same_views():
     seen = robot_views(4, count=9, robot=(0.2e-3, 0.02))
     result = solve_hand_eye(seen, "eye-to-hand", image_size=SIZE)
@@ -115,6 +133,16 @@ def test_the_camera_may_come_from_the_same_views():
     assert off_mm(result.camera_pose, X) < 5
     with pytest.raises(SolveError, match="size of the pictures"):
         solve_hand_eye(seen, "eye-to-hand")
+
+
+def test_the_camera_is_chosen_as_by_the_intrinsic_solver():
+    """A flat board stays flat when its views carry robot poses."""
+    for seed in (4, 15, 16):
+        seen = robot_views(seed, count=9, robot=(0.2e-3, 0.02))
+        alone = solve_intrinsic(seen, SIZE)
+        result = solve_hand_eye(seen, "eye-to-hand", image_size=SIZE)
+        assert "warp" not in result.chosen
+        assert np.array_equal(result.warp, alone.warp)
 
 
 def test_the_order_of_the_views_does_not_matter():
@@ -227,6 +255,31 @@ def test_the_start_stands_almost_half_of_the_views_being_wrong():
     C = invert(X) @ A @ Y
     C[:5] = C[[1, 2, 3, 4, 0]]
     assert np.allclose(robust_start(A, C), (X, Y), atol=1e-6)
+
+
+def test_many_views_need_no_list_of_all_subsets():
+    rng = np.random.default_rng(4)
+    A = np.array([pose_matrix(rng.normal(size=3), rng.normal(size=3)) for _ in range(80)])
+    tracemalloc.start()
+    try:
+        found = robust_start(A, invert(X) @ A @ Y)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.allclose(found, (X, Y), atol=1e-9)
+    assert peak < 10e6
+
+
+def test_a_view_lost_under_the_camera_is_lost_to_the_camera_too():
+    """Here because its corners lie where the camera's distortion has no inverse."""
+    seen = robot_views(14, count=8)
+    fit, _ = fit_camera(seen, SIZE, CameraOption(warp=False))
+    folding = replace(fit.camera, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    bent = replace(fit, solution=replace(fit.solution, state=replace(fit.state, camera=folding)))
+    again, found, lost = located(seen, bent)
+    assert lost
+    assert again.names == tuple(found)
+    assert {r.id for r in lost} | set(found) == {view.id for view in seen}
 
 
 def test_scatter_is_that_of_the_axes():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cellctl.calib.camera import CameraModel
+from cellctl.errors import BadInput
 from cellctl.geometry import rigid
 from cellctl.offline import solve_dataset
 
@@ -83,5 +84,53 @@ def test_intrinsic_pictures_come_along(shared_data, tmp_path):
         document["intrinsic_image_size"] = document["image_size"]
 
     result = solve_dataset(copied(shared_data / "ur_charuco_eih", tmp_path, separate))
+    assert (result["verdict"], result["reasons"]) == ("pass", [])
     assert result["held_out_px"] < 0.6
     assert not any("free camera" in name for name in result["candidates"])
+    assert len(result["intrinsic"]["views"]["used"]) == 7
+    assert result["intrinsic"]["rms_px"] <= result["intrinsic"]["held_out_px"] < 0.5
+    assert any("add views with the board near" in r for r in result["intrinsic"]["remarks"])
+
+
+def test_copies_of_pictures_change_nothing(shared_data, tmp_path):
+    """Counted twice, a view would vouch for itself; five copies would outvote the others."""
+
+    def copy(document):
+        first = document["views"][0]
+        document["views"] += [{**view, "id": f"{view['id']}b"} for view in document["views"]]
+        document["views"] += [{**first, "id": f"z{i}"} for i in range(5)]
+
+    source = shared_data / "ur_charuco_eih"
+    plain, doubled = solve_dataset(source), solve_dataset(copied(source, tmp_path, copy))
+    assert doubled["held_out_px"] == plain["held_out_px"]
+    assert doubled["views"]["used"] == plain["views"]["used"]
+    assert {r["reason"] for r in doubled["views"]["rejected"]} == {
+        f"the same picture as view '{name}'" for name in plain["views"]["used"]
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "words"),
+    [
+        ("opencv_left_intr", {"inner_corners": [8, 6]}, "goes on beyond 8x6 inner corners"),
+        ("ur_charuco_eih", {"legacy": True}, "legacy is stated wrong"),
+    ],
+)
+def test_a_board_stated_wrong_is_bad_input(shared_data, tmp_path, name, wrong, words):
+    folder = copied(shared_data / name, tmp_path, lambda d: d["board"].update(wrong))
+    with pytest.raises(BadInput, match=f"not seen in any picture.*{words}"):
+        solve_dataset(folder)
+
+
+def test_a_board_of_another_size_fails_and_says_so(shared_data, tmp_path):
+    def larger(document):
+        for key in ("square_m", "marker_m"):
+            document["board"][key] *= 1.1
+
+    source = shared_data / "ur_charuco_eih"
+    plain, wrong = solve_dataset(source), solve_dataset(copied(source, tmp_path, larger))
+    assert wrong["verdict"] == "fail"
+    assert any("% smaller than stated" in reason for reason in wrong["reasons"])
+    apart = np.array(wrong["T_flange_camera"]) - np.array(plain["T_flange_camera"])
+    assert np.linalg.norm(apart[:3, 3]) < 1e-3
+    assert wrong["camera"]["K"][0][0] == pytest.approx(plain["camera"]["K"][0][0], rel=2e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cellctl.calib.targets import board_from_dict
 from cellctl.sim.noise import NoiseBank
 from cellctl.sim.optics import Optics
 from cellctl.sim.presets import CR
@@ -13,7 +14,6 @@ from cellctl.sim.truth import draw
 from tests.sim.scenes import board_pixels, frames_with_flange, random_flange, still
 
 SEED, VIEWS = 8, 8
-targets = pytest.importorskip("cellctl.calib.targets", reason="no detectors in this tree yet")
 
 
 @pytest.mark.parametrize("name", ["checkerboard", "markers"])
@@ -21,7 +21,7 @@ def test_detectors_find_printed_points_where_the_truth_projects_them(name):
     truth = draw(CR, SEED)
     optics, rng = Optics(truth), np.random.default_rng(6)
     bank = NoiseBank(SEED, CR.camera.size_px[::-1], CR.camera.noise_sigma)
-    board = targets.board_from_dict(description(name, CR.boards), name)
+    board = board_from_dict(description(name, CR.boards), name)
     means = []
     for i in range(VIEWS):
         flange = random_flange(truth, name, rng, distance=(0.35, 0.7))
