@@ -55,7 +55,8 @@ def about_camera(views: list[PlannedView], count: int, seed: int) -> list[Planne
     the place that all these motions have nearest in common: with p' = R p + t, that is the least-
     squares solution p of (I - R) p = t over all pairs. Of SUBSETS random sets the one with the
     nearest such place is taken; along the camera's axis it matters less, because there the plane
-    map feels only a change of size.
+    map feels only a change of size. Only the half of the sets with the more varied tilts counts:
+    hand-eye needs rotations about two axes before all else.
     """
     if len(views) <= count:
         return list(views)
@@ -66,8 +67,15 @@ def about_camera(views: list[PlannedView], count: int, seed: int) -> list[Planne
     right = np.einsum("ijba,ijb->ija", A, t)
     rng = np.random.default_rng(seed)
     drawn = [rng.permutation(len(views)) for _ in range(SUBSETS)]
+    varied = np.array([_variety(poses[order[:count], :2, 2]) for order in drawn])
+    drawn = [drawn[i] for i in np.flatnonzero(varied >= np.median(varied))]
     best = min(drawn, key=lambda order: _distance(normal, right, order[:count]))
     return [views[i] for i in best]
+
+
+def _variety(tilts: Array) -> float:
+    """How far the tilts (n, 2) are scattered about the direction in which they are least so."""
+    return float(np.linalg.svd(tilts - tilts.mean(axis=0), compute_uv=False)[-1])
 
 
 def _distance(normal: Array, right: Array, chosen: Array) -> float:
