@@ -13,6 +13,12 @@ from cellctl.calib.hand_eye_fit import Mount
 from cellctl.calib.views import Rejection
 from cellctl.geometry import Array, Transform
 
+POSES = {
+    "eye-to-hand": ("T_base_camera", "T_flange_board"),
+    "eye-in-hand": ("T_flange_camera", "T_base_board"),
+}
+"""How results call the poses of camera and board, by mount."""
+
 
 @dataclass(frozen=True, eq=False)
 class HandEyeView:
@@ -69,8 +75,9 @@ class HandEyeResult:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON form, as `cellctl solve --json` prints it."""
-        poses = (self.camera_pose, self.board_pose)
+        """JSON form, as `cellctl solve --json` prints it. The robot's frame is called `base` and the
+        board's `board` there, whatever they are called elsewhere."""
+        camera, board = POSES[self.mount]
         return {
             "mount": self.mount,
             "views": {
@@ -81,7 +88,8 @@ class HandEyeResult:
             "held_out_px": self.held_out_px,
             "held_out_used_px": self.held_out_used_px,
             "camera": self.camera.to_dict(),
-            **{f"T_{pose.parent}_{pose.child}": pose.to_list() for pose in poses},
+            camera: self.camera_pose.to_list(),
+            board: self.board_pose.to_list(),
             "method": self.chosen,
             "why": self.why,
             "candidates": {

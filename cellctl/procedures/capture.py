@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from cellctl.calib.sharpness import sharpness
+from cellctl.calib.sharpness import TOO_BLURRED_PX, sharpness
 from cellctl.calib.targets import Board, Detection
 from cellctl.cell import Cell
 from cellctl.drivers.base import Frame, Image, RobotState
@@ -31,7 +31,7 @@ class CaptureLimits:
 
     rest_s: float = 0.5
     shift_px: float = 0.05
-    sharpness_px: float = 3.0
+    sharpness_px: float = TOO_BLURRED_PX
     seen_share: float = 0.75
     pictures: int = 4
     tries: int = 12

@@ -54,7 +54,13 @@ def seen(record: Record[HandEyeParams]) -> Observed:
 
 def solve(views: Observed, camera: CameraModel) -> HandEyeResult:
     """Pure: T_world_camera and T_flange_markers from what was seen."""
-    return hand_eye.solve_hand_eye(views.views, "eye-to-hand", camera=camera, board=BOARD)
+    return hand_eye.solve_hand_eye(
+        views.views,
+        "eye-to-hand",
+        camera=camera,
+        board=BOARD,
+        minimum_points=views.minimum_points,
+    )
 
 
 def judge(result: HandEyeResult, params: HandEyeParams) -> tuple[str, tuple[str, ...]]:

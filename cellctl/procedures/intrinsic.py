@@ -51,7 +51,9 @@ def seen(record: Record[IntrinsicParams]) -> Observed:
 
 def solve(views: Observed) -> IntrinsicResult:
     """Pure: the camera from what was seen."""
-    return intrinsic.solve_intrinsic(views.views, views.image_size)
+    return intrinsic.solve_intrinsic(
+        views.views, views.image_size, minimum_points=views.minimum_points
+    )
 
 
 def judge(result: IntrinsicResult, params: IntrinsicParams) -> tuple[str, tuple[str, ...]]:

@@ -20,11 +20,13 @@ NOT_FOUND = "the board was not found in the picture"
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Good views of a board, and the samples that were not good."""
+    """Good views of a board, and the samples that were not good. A view must have
+    `minimum_points` to count."""
 
     views: list[RobotView]
     bad: list[Rejection]
     image_size: tuple[int, int]
+    minimum_points: int
 
     def merged(self, solved: dict[str, Any]) -> dict[str, Any]:
         """A solver's JSON, with the samples that never reached the solver among the rejected."""
@@ -56,7 +58,7 @@ def observed(record: Record[Any], step: str, board: Board) -> Observed:
             bad.append(Rejection(key, NOT_FOUND))
         else:
             views.append(view)
-    return Observed(views, bad, record.config.camera.image_size_px)
+    return Observed(views, bad, record.config.camera.image_size_px, board.minimum_points)
 
 
 def journalled(sample: Sample, board: Board) -> RobotView | None:

@@ -49,14 +49,11 @@ def test_solved_again_offline_it_is_the_online_result(done):
 def test_pictures_and_poses_are_on_disk(done):
     cell, info = done
     folder = cell.folder / "runs" / info.run_id
-    samples = [json.loads(line) for line in cell.journal(info.run_id)]
-    named = [
-        image["file"]
-        for line in samples
-        if line["kind"] == "sample"
-        for image in line["data"]["images"].values()
-    ]
-    assert len(named) >= info.samples
+    lines = [json.loads(line) for line in cell.journal(info.run_id)]
+    samples = [line for line in lines if line["kind"] == "sample"]
+    named = [image["file"] for line in samples for image in line["data"]["images"].values()]
+    assert len(samples) == info.samples
+    assert len(named) >= 8 + 5 + 1
     assert all((folder / name).is_file() for name in named)
 
 
