@@ -75,7 +75,7 @@ class HandEyeResult:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON form, as `cellctl solve --json` prints it. The robot's frame is called `base` and the
+        """JSON form, as `cellctl solve --json` prints it. The robot's frame is `base` and the
         board's `board` there, whatever they are called elsewhere."""
         camera, board = POSES[self.mount]
         return {
