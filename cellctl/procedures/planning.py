@@ -28,7 +28,7 @@ SEARCH_CHOICES = 24
 CONNECT_TRIES = 5
 HUBS_TRIED = 12
 BRIDGES = 2
-ENOUGH_CHOICE = 60
+ENOUGH_CHOICE, CHOICE_PER_VIEW = 60, 6
 CANDIDATES, CANDIDATES_PER_VIEW = 400, 12
 PLACING_ROUNDS = 3
 """Where a board appears depends on where it is: so often is its place in the picture put right."""
@@ -198,6 +198,7 @@ def _reachable_views(
 ) -> list[PlannedView]:
     """A choice to pick `count` views from: candidates are drawn, and paths to them searched,
     until it is large or drawing more is no use."""
+    enough = max(2 * count, min(ENOUGH_CHOICE, CHOICE_PER_VIEW * count))
     views: list[PlannedView] = []
     road = Roadmap(guard, here, np.empty((0, JOINTS)))
     for batch in range(BATCHES):
@@ -208,7 +209,7 @@ def _reachable_views(
         bridged = BRIDGES
         while len(_different(views, road)) < 2 * count and bridged:
             bridged = bridged - 1 if road.bridge() else 0
-        if len(_different(views, road)) >= max(2 * count, ENOUGH_CHOICE):
+        if len(_different(views, road)) >= enough:
             break
     return _different(views, road)
 
