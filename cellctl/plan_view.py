@@ -201,7 +201,8 @@ def _draw_views(axis: Axes, config: CellConfig, part: Planned) -> None:
         corners = part.rig.board_points(view.T_camera_board[None])[0][[0, 1, 3, 2]]
         pixels = part.rig.camera.project(corners)
         axis.add_patch(Polygon(pixels, fill=False, edgecolor="tab:green", linewidth=0.8))
-        axis.annotate(str(number), pixels.mean(axis=0), ha="center", fontsize=7)
+        x, y = pixels.mean(axis=0)
+        axis.annotate(str(number), (x, y), ha="center", fontsize=7)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     axis.set_aspect("equal")
