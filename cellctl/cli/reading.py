@@ -32,6 +32,8 @@ def status(as_json: AsJson = False, endpoint: Connect = HERE, cell: CellId = Non
 
 def _print_state(state: State, endpoint: str) -> None:
     grid = Table.grid(padding=(0, 2))
+    grid.add_column()
+    grid.add_column(overflow="fold")  # a command that is cut short helps nobody
     kind = "simulated" if state.simulated else "real"
     rows = {
         "cell": f"{state.cell} ({kind}) at {endpoint}",
