@@ -225,6 +225,8 @@ def first_reached(
 ) -> tuple[PlannedView, Path] | None:
     """The first of `views` that an allowed path leads to from `here`, and that path, if need be
     over other views or over the postures `hubs` (n, 6)."""
+    if views and guard.allows(here, direct := Path(views[0].joints[None])):
+        return views[0], direct
     joints = np.array([view.joints for view in views]).reshape(-1, JOINTS)
     road = Roadmap(guard, here, np.vstack([joints, hubs]))
     reached = [i for i in sorted(road.index) if i < len(views)]
