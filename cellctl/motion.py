@@ -97,6 +97,7 @@ class Guard:
         )
         self._wraps = [body.wrapped() for body in bodies]
         self._pairs = _pairs(bodies)
+        self._pair_names = tuple(f"{bodies[i].name} and {bodies[j].name}" for i, j in self._pairs)
 
     def cautious(self, *postures: Array) -> Guard:
         """A guard that keeps SLACK_M and SLACK_RAD more away from everything, to plan with: its
@@ -127,7 +128,8 @@ class Guard:
         frames = self.arm.link_frames(joints)
         outside = ~self.arm.within_limits(joints, self.joint_margin)
         limit = Rule("is at its limit", ("a joint",), outside[:, None])
-        return [limit, *self._surroundings(frames), self._self_collision(frames)]
+        spheres = [body.world(frames) for body in self.bodies]
+        return [limit, *self._surroundings(spheres), self._self_collision(frames, spheres)]
 
     def check(self, start: Array, path: Path) -> None:
         """MotionRefused unless the whole path from the joints `start` (6,) is allowed."""
@@ -188,9 +190,10 @@ class Guard:
         centres, _ = self.spheres(joints)
         return float(PIECES * np.linalg.norm(np.diff(centres, axis=0), axis=2).max())
 
-    def _surroundings(self, frames: Array) -> list[Rule]:
+    def _surroundings(self, spheres: list[Array]) -> list[Rule]:
         scene, reach = self.scene, self._reach
-        centres = np.concatenate([body.world(frames) for body in self._free_bodies], axis=1)
+        free = [s for s, b in zip(spheres, self.bodies, strict=True) if b.frame >= FIRST_FREE_FRAME]
+        centres = np.concatenate(free, axis=1)
         room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
         height = centres[..., 2] - scene.table_height
         rules = [
@@ -206,20 +209,17 @@ class Guard:
             rules.append(Rule(f"comes too near to the {name}", self._who, near))
         return rules
 
-    def _self_collision(self, frames: Array) -> Rule:
+    def _self_collision(self, frames: Array, spheres: list[Array]) -> Rule:
         """Which pairs of bodies meet: looked at sphere by sphere where the balls around them do."""
         wraps = np.concatenate([wrap.world(frames) for wrap in self._wraps], axis=1)
         radii = np.concatenate([wrap.radii for wrap in self._wraps])
         i, j = np.array(self._pairs).T
-        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (
-            radii[i] + radii[j] + MAX_STEP_M
-        ) ** 2
+        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
         for k in np.flatnonzero(near.any(axis=0)):
-            one, other = self.bodies[i[k]], self.bodies[j[k]]
-            some = frames[near[:, k]]
-            near[near[:, k], k] = _meet(one.world(some), one.radii, other.world(some), other.radii)
-        who = tuple(f"{self.bodies[a].name} and {self.bodies[b].name}" for a, b in self._pairs)
-        return Rule("meet", who, near)
+            a, b, some = i[k], j[k], near[:, k]
+            one, other = spheres[a][some], spheres[b][some]
+            near[some, k] = _meet(one, self.bodies[a].radii, other, self.bodies[b].radii)
+        return Rule("meet", self._pair_names, near)
 
 
 def _pairs(bodies: tuple[Body, ...]) -> list[tuple[int, int]]:
