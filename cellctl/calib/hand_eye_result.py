@@ -10,7 +10,7 @@ import numpy as np
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.hand_eye_choice import Candidate
 from cellctl.calib.hand_eye_fit import Mount
-from cellctl.calib.views import Rejection
+from cellctl.calib.views import Rejection, shortage
 from cellctl.geometry import Array, Transform
 
 POSES = {
@@ -128,12 +128,7 @@ def judge(
 ) -> tuple[str, tuple[str, ...]]:
     """("pass" or "fail", reasons in words); a pass has no reasons."""
     limits = limits or HandEyeLimits()
-    used, total = len(result.views), len(result.views) + len(result.rejected)
-    reasons = []
-    if used < limits.views:
-        reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
-    if total - used > limits.rejected * total:
-        reasons.append(f"{total - used} of {total} views were rejected")
+    reasons = shortage(len(result.views), len(result.rejected), limits.views, limits.rejected)
     smallest, second, largest = result.axis_scatter_deg
     if smallest < limits.scatter_deg[0] or second < limits.scatter_deg[1]:
         reasons.append(

@@ -14,7 +14,7 @@ from cellctl.calib.camera_fit import MINIMUM_POINTS, CameraFit, CameraOption, fi
 from cellctl.calib.chain import Chain, Free
 from cellctl.calib.pose import board_pose
 from cellctl.calib.schur import minimise
-from cellctl.calib.views import Batch, Rejection, View, excess, ordered, rms
+from cellctl.calib.views import Batch, Rejection, View, excess, ordered, rms, shortage
 from cellctl.errors import SolveError
 from cellctl.geometry import Array
 
@@ -81,12 +81,7 @@ def judge(
 ) -> tuple[str, tuple[str, ...]]:
     """("pass" or "fail", reasons in words); a pass has no reasons."""
     limits = limits or IntrinsicLimits()
-    used, total = len(result.views), len(result.views) + len(result.rejected)
-    reasons = []
-    if used < limits.views:
-        reasons.append(f"only {used} views could be used; at least {limits.views} are needed")
-    if total - used > limits.rejected * total:
-        reasons.append(f"{total - used} of {total} views were rejected")
+    reasons = shortage(len(result.views), len(result.rejected), limits.views, limits.rejected)
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "

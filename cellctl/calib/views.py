@@ -46,6 +46,16 @@ class Rejection:
         return {"id": self.id, "reason": self.reason}
 
 
+def shortage(used: int, rejected: int, least: int, share: float) -> list[str]:
+    """Reasons against a verdict: fewer than `least` views used, more than `share` rejected."""
+    reasons = []
+    if used < least:
+        reasons.append(f"only {used} views could be used; at least {least} are needed")
+    if rejected > share * (used + rejected):
+        reasons.append(f"{rejected} of {used + rejected} views were rejected")
+    return reasons
+
+
 AnyView = TypeVar("AnyView", bound=View)
 
 

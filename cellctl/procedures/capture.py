@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from cellctl.calib.printed import Unseen
 from cellctl.calib.sharpness import TOO_BLURRED_PX, sharpness
 from cellctl.calib.targets import Board, Detection
 from cellctl.cell import Cell
 from cellctl.drivers.base import Frame, Image, RobotState
 from cellctl.errors import DeviceFault
-from cellctl.procedures.observations import NOT_FOUND
 
 DETECT_TIMEOUT_S = 20.0
 BLOCK_PX, BLOCK_LEVELS = 16, 4
@@ -57,11 +57,12 @@ async def shoot(cell: Cell, board: Board, after: float, limits: CaptureLimits) -
     """A picture of a still board; the arm has stood since cell time `after`."""
     frames, flaw = await _still_frames(cell, board, after + limits.rest_s, limits)
     image = await asyncio.to_thread(mean_image, frames)
-    detection = await detect(cell, board, image)
+    found = Unseen(flaw) if flaw else await look(cell, board, image)
     state = await cell.robot.state_at(frames[-1].t + frames[-1].exposure_s)
     flaw = flaw or _moving(frames, state)
     still = not flaw
-    flaw = flaw or judge_detection(board, detection, image, limits)
+    flaw = flaw or judge_sight(board, found, image, limits)
+    detection = None if isinstance(found, Unseen) else found
     return Shot(image, detection, state, len(frames), still, flaw)
 
 
@@ -73,12 +74,12 @@ async def _still_frames(
     for _ in range(limits.tries):
         frame = await cell.camera.grab(exposed_after=after)
         after = frame.t + frame.exposure_s
-        detection = await detect(cell, board, frame.image)
-        if detection is None:
-            return [frame], NOT_FOUND
-        if last is not None and shift_px(last, detection) < limits.shift_px:
+        found = await look(cell, board, frame.image)
+        if isinstance(found, Unseen):
+            return [frame], found.reason
+        if last is not None and shift_px(last, found) < limits.shift_px:
             return [frame, *await grab_frames(cell, after, limits.pictures - 1)], ""
-        last = detection
+        last = found
     return [frame], f"still moving after {limits.tries} pictures"
 
 
@@ -120,10 +121,10 @@ async def darken(cell: Cell) -> None:
     await cell.projector.show(np.zeros((height, width), np.uint8))
 
 
-async def detect(cell: Cell, board: Board, image: Image) -> Detection | None:
-    """`board.detect(image)` in the solver's process."""
-    found: Detection | None = await cell.solver.call(
-        board.detect, image, timeout_s=DETECT_TIMEOUT_S
+async def look(cell: Cell, board: Board, image: Image) -> Detection | Unseen:
+    """`board.look(image)` in the solver's process."""
+    found: Detection | Unseen = await cell.solver.call(
+        board.look, image, timeout_s=DETECT_TIMEOUT_S
     )
     return found
 
@@ -153,16 +154,16 @@ def _moving(frames: list[Frame], state: RobotState) -> str:
     return "" if state.standstill_s > spanned else "the arm moved while the pictures were taken"
 
 
-def judge_detection(
-    board: Board, detection: Detection | None, image: Image, limits: CaptureLimits
+def judge_sight(
+    board: Board, found: Detection | Unseen, image: Image, limits: CaptureLimits
 ) -> str:
-    """What is wrong with a detection; empty when nothing is."""
-    if detection is None:
-        return NOT_FOUND
-    share = len(detection.ids) / len(board.points)
+    """What is wrong with what was seen; empty when nothing is."""
+    if isinstance(found, Unseen):
+        return found.reason
+    share = len(found.ids) / len(board.points)
     if share < limits.seen_share:
         return f"partly seen: {share:.0%} of the board's points"
-    blur = sharpness(image, detection)
+    blur = sharpness(image, found)
     if blur > limits.sharpness_px:
         return f"blurred: edges are {blur:.1f} px wide"
     return ""

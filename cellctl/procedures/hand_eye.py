@@ -15,7 +15,7 @@ from cellctl.procedures import sweep
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits
 from cellctl.procedures.knowledge import board_of, known
-from cellctl.procedures.observations import Observed, observed
+from cellctl.procedures.observations import Collected, collected
 from cellctl.procedures.planning import Spread
 from cellctl.procedures.record import Record, recorded
 from cellctl.run import Procedure, Result, Run
@@ -47,12 +47,12 @@ async def collect(run: Run, cell: Cell, params: HandEyeParams, belief: Belief) -
     return await sweep.collect(run, cell, sweep_of(cell.config, params), belief)
 
 
-def seen(record: Record[HandEyeParams]) -> Observed:
+def seen(record: Record[HandEyeParams]) -> Collected:
     """The views that were recorded."""
-    return observed(record, sweep.VIEWS, board_of(record.config, BOARD))
+    return collected(record, sweep.VIEWS, board_of(record.config, BOARD))
 
 
-def solve(views: Observed, camera: CameraModel) -> HandEyeResult:
+def solve(views: Collected, camera: CameraModel) -> HandEyeResult:
     """Pure: T_world_camera and T_flange_markers from what was seen."""
     return hand_eye.solve_hand_eye(
         views.views,

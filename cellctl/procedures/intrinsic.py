@@ -12,7 +12,7 @@ from cellctl.procedures import sweep
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits
 from cellctl.procedures.knowledge import board_of, known
-from cellctl.procedures.observations import Observed, observed
+from cellctl.procedures.observations import Collected, collected
 from cellctl.procedures.planning import Spread
 from cellctl.procedures.record import Record, recorded
 from cellctl.run import Procedure, Result, Run
@@ -44,12 +44,12 @@ async def collect(run: Run, cell: Cell, params: IntrinsicParams, belief: Belief)
     return await sweep.collect(run, cell, sweep_of(cell.config, params), belief)
 
 
-def seen(record: Record[IntrinsicParams]) -> Observed:
+def seen(record: Record[IntrinsicParams]) -> Collected:
     """The views that were recorded."""
-    return observed(record, sweep.VIEWS, board_of(record.config, BOARD))
+    return collected(record, sweep.VIEWS, board_of(record.config, BOARD))
 
 
-def solve(views: Observed) -> IntrinsicResult:
+def solve(views: Collected) -> IntrinsicResult:
     """Pure: the camera from what was seen."""
     return intrinsic.solve_intrinsic(
         views.views, views.image_size, minimum_points=views.minimum_points

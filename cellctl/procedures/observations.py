@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cellctl.calib.printed import Unseen
 from cellctl.calib.targets import Board, Detection
 from cellctl.calib.views import Rejection, RobotView
 from cellctl.drivers.base import Image
@@ -15,11 +16,9 @@ from cellctl.geometry import Array, Transform
 from cellctl.procedures.record import Record
 from cellctl.store.history import Sample
 
-NOT_FOUND = "the board was not found in the picture"
-
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class Collected:
     """Good views of a board, and the samples that were not good. A view must have
     `minimum_points` to count."""
 
@@ -46,33 +45,35 @@ def observation(detection: Detection | None) -> dict[str, Any]:
     }
 
 
-def observed(record: Record[Any], step: str, board: Board) -> Observed:
+def collected(record: Record[Any], step: str, board: Board) -> Collected:
     """The views of a sweep's samples. BadInput names a sample whose data are not a view."""
     views, bad = [], []
     for key, sample in sorted(record.samples(step).items()):
         if flaw := sample.data.get("flaw"):
             bad.append(Rejection(key, flaw))
             continue
-        view = _detected(sample, board) if record.again else journalled(sample, board)
-        if view is None:
-            bad.append(Rejection(key, NOT_FOUND))
+        view = _seen_again(sample, board) if record.again else journalled(sample, board)
+        if isinstance(view, Unseen):
+            bad.append(Rejection(key, view.reason))
         else:
             views.append(view)
-    return Observed(views, bad, record.config.camera.image_size_px, board.minimum_points)
+    return Collected(views, bad, record.config.camera.image_size_px, board.minimum_points)
 
 
-def journalled(sample: Sample, board: Board) -> RobotView | None:
-    """The view as it was detected when the sample was taken; None when nothing was."""
+def journalled(sample: Sample, board: Board) -> RobotView | Unseen:
+    """The view as it was detected when the sample was taken."""
     data = sample.data
     if not data["ids"]:
-        return None
+        return Unseen(data["flaw"])
     return _view(sample, board, np.array(data["points"]), np.array(data["pixels"]))
 
 
-def _detected(sample: Sample, board: Board) -> RobotView | None:
+def _seen_again(sample: Sample, board: Board) -> RobotView | Unseen:
     """The view as it is detected now in the picture on disk."""
-    found = board.detect(picture(sample))
-    return None if found is None else _view(sample, board, found.points, found.pixels)
+    found = board.look(picture(sample))
+    if isinstance(found, Unseen):
+        return found
+    return _view(sample, board, found.points, found.pixels)
 
 
 def picture(sample: Sample) -> Image:

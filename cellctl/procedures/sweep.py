@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cellctl.arms import JOINTS
+from cellctl.calib.printed import Unseen
 from cellctl.calib.targets import Board
 from cellctl.calib.views import RobotView
 from cellctl.cell import Cell
@@ -114,7 +115,7 @@ def _found(run: Run, board: Board) -> list[RobotView]:
     """The views of a search in which the board was seen, and stood still."""
     still = [sample for sample in run.samples().values() if sample.data["still"]]
     views = [journalled(sample, board) for sample in still]
-    return [view for view in views if view is not None]
+    return [view for view in views if not isinstance(view, Unseen)]
 
 
 def _visited(samples: Mapping[str, Sample]) -> Array:
