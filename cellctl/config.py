@@ -141,6 +141,25 @@ class ProjectorSection(Section):
     pose: Pose
 
 
+class Rectangle(Section):
+    """A rectangle on the table, along the world's x and y."""
+
+    min_m: tuple[float, float]
+    max_m: tuple[float, float]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Rectangle:
+        if not np.all(np.array(self.min_m) < np.array(self.max_m)):
+            raise ValueError("min_m must be below max_m in x and y")
+        return self
+
+
+class SheetSection(Rectangle):
+    """Paper on the table, where the pen may be down. Its used spots are kept by its name."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]{1,32}$")
+
+
 class TableSection(Section):
     """`pose`: centre of the lit area, z up. `touched_height_m`: the table's height in the world
     frame as the robot knows it, from touching it. `area_m`: what is calibrated and drawn in."""
@@ -180,10 +199,15 @@ class BoardMount(Section):
 
 
 class PenMount(Section):
-    """The pen on the flange: `tip_m` as far as known, and the radius of its hull."""
+    """The pen on the flange: `tip_m` as far as known, and the radius of its hull. Its holder gives
+    way by `travel_m` along the flange's z, and `feels_contact` if arm or holder can. `line_m` is
+    the width of the line that it draws."""
 
     tip_m: Vector
     radius_m: Positive
+    travel_m: Positive = 0.005
+    line_m: Positive = 0.001
+    feels_contact: bool = False
 
 
 class BracketSection(Section):
@@ -223,6 +247,7 @@ class CellConfig(Section):
     camera: CameraSection
     projector: ProjectorSection
     table: TableSection
+    sheets: tuple[SheetSection, ...] = ()
     bracket: BracketSection
     workspace: WorkspaceSection
 
@@ -234,6 +259,14 @@ class CellConfig(Section):
             if "sim" in (self.robot.driver, self.camera.driver, self.projector.driver):
                 raise ValueError('driver "sim" needs a [simulation] section')
         return self
+
+    @field_validator("sheets")
+    @classmethod
+    def _named_once(cls, value: tuple[SheetSection, ...]) -> tuple[SheetSection, ...]:
+        names = [sheet.name for sheet in value]
+        if len(set(names)) < len(names):
+            raise ValueError("every sheet needs a name of its own")
+        return value
 
     def data_dir(self) -> Path:
         """Where this cell keeps its runs; CELLCTL_DATA wins over the file."""

@@ -61,6 +61,25 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
+class Stroke:
+    """A line that the pen follows without stopping: joints (n, 6) rad, at most a millimetre of
+    the tip apart, from where the arm stands still. `speed_m_s` is that of the tip, as commanded."""
+
+    joints: Array
+    speed_m_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeResult:
+    """How a stroke was followed: measured joints (k, 6) at times `t` (k,), and the settled state
+    at its end."""
+
+    t: Array
+    joints: Array
+    state: RobotState
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """A camera picture: its exposure started at `t` and lasted `exposure_s`."""
 
@@ -87,6 +106,16 @@ class Robot(Protocol):
 
     async def move(self, target: Target, *, timeout_s: float) -> RobotState:
         """Follow the path; done when the arm stands still at its end by measured joint speed."""
+        ...
+
+    async def draw(self, stroke: Stroke, *, timeout_s: float) -> StrokeResult:
+        """Follow the stroke; done when the arm stands still at its end. DeviceFault when it was
+        not followed to its end: what was drawn of it is then unknown."""
+        ...
+
+    async def touch(self, stroke: Stroke, *, timeout_s: float) -> RobotState:
+        """Follow the stroke until the tool feels a contact, and stop there. Returns the state at
+        which the contact was felt; DeviceFault when none was felt until the stroke's end."""
         ...
 
     async def stop(self, *, clean: bool) -> None:
