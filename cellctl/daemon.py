@@ -21,8 +21,9 @@ from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Frame, Identity, Projector, Robot
 from cellctl.engine import Engine
 from cellctl.gate import Gate
+from cellctl.guarded_robot import GuardedRobot
 from cellctl.messages import RobotSnapshot
-from cellctl.motion import GuardedRobot, guard_of
+from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.procedures import PROCEDURES
 from cellctl.sim.drivers import SimCamera, SimProjector, SimRobot

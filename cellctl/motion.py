@@ -8,18 +8,16 @@ config says, and a person's arm is not in the config.
 
 from __future__ import annotations
 
-import asyncio
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cellctl.arms import JOINTS, ArmModel, arm
 from cellctl.config import Box, CellConfig
-from cellctl.drivers.base import Identity, Path, Robot, RobotState, Target
+from cellctl.drivers.base import Path, Stroke
 from cellctl.errors import MotionRefused
-from cellctl.geometry import Array, Mask, invert, rotation_angle
+from cellctl.geometry import Array, Mask
 from cellctl.hulls import Body, box_body, link_bodies, pen_body
 
 FIRST_FREE_FRAME = 2
@@ -33,8 +31,8 @@ MAX_STEP_M = 0.01
 COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
-FLANGE_M, FLANGE_DEG = 0.02, 2.0
-"""An arm's own calibration differs from its data sheet by less."""
+PEN = "pen"
+TABLE = "comes too near to the table"
 SLACK_M, SLACK_RAD = 0.005, 0.005
 """Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
 
@@ -46,6 +44,25 @@ class Keepout:
     name: str
     low: Array
     high: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pen:
+    """What may touch the table: `tip` (3,) in the flange frame gives way by `travel`, and may be
+    down on `sheets` (n, 2, 2), lowest and highest (x, y) each, in the world; metres."""
+
+    tip: Array
+    travel: float
+    sheets: Array
+
+    def tips(self, flanges: Array) -> Array:
+        """Tips (n, 3) in the world for T_world_flange (n, 4, 4)."""
+        return flanges[..., :3, :3] @ self.tip + flanges[..., :3, 3]
+
+    def on_sheet(self, xy: Array) -> Mask:
+        """Whether each of xy (n, 2) lies on a sheet."""
+        inside = (xy[:, None] >= self.sheets[:, 0]) & (xy[:, None] <= self.sheets[:, 1])
+        return inside.all(axis=2).any(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +103,9 @@ class Guard:
         scene: Scene,
         clearance_m: float,
         joint_margin_rad: float,
+        pen: Pen | None = None,
     ) -> None:
-        self.arm, self.bodies, self.scene = model, bodies, scene
+        self.arm, self.bodies, self.scene, self.pen = model, bodies, scene, pen
         self.clearance, self.joint_margin = clearance_m, joint_margin_rad
         free = [body for body in bodies if body.frame >= FIRST_FREE_FRAME]
         self._free_bodies = free
@@ -105,7 +123,7 @@ class Guard:
         guard itself where the cautious one would not let the arm be at one of `postures` (6,)."""
         bodies = tuple(replace(body, radii=body.radii + SLACK_M) for body in self.bodies)
         margin = self.joint_margin + SLACK_RAD
-        cautious = Guard(self.arm, bodies, self.scene, self.clearance, margin)
+        cautious = Guard(self.arm, bodies, self.scene, self.clearance, margin, self.pen)
         return cautious if cautious.free(np.array(postures)).all() else self
 
     def free(self, joints: Array) -> Mask:
@@ -121,6 +139,48 @@ class Guard:
             if broken.any() and (first is None or index < first.index):
                 first = Violation(index, f"{rule.who[int(np.argmax(broken))]} {rule.what}")
         return first
+
+    def draws(self, joints: Array) -> Mask:
+        """Whether each of joints (n, 6) is allowed to an arm that draws: as `free`, but the pen may
+        be on the table."""
+        rules = self._drawing_rules(np.atleast_2d(joints))
+        return ~np.logical_or.reduce([rule.broken.any(axis=1) for rule in rules])
+
+    def check_stroke(self, stroke: Stroke) -> None:
+        """MotionRefused unless all of a stroke is allowed. In it, and only in it, the pen may come
+        down to the table over a sheet, and be pushed in by its travel."""
+        joints = np.asarray(stroke.joints, dtype=float)
+        if joints.ndim != 2 or joints.shape[1] != JOINTS or not len(joints):
+            raise MotionRefused(f"a stroke is (n, {JOINTS}) joint angles, not {joints.shape}")
+        if not np.isfinite(joints).all() or not 0.0 < stroke.speed_m_s < np.inf:
+            raise MotionRefused("a stroke is finite joint angles and a speed above zero")
+        steps = np.linalg.norm(np.diff(self.spheres(joints)[0], axis=0), axis=2)
+        if steps.max(initial=0.0) > MAX_STEP_M:
+            raise MotionRefused(
+                f"a stroke's points are {1e3 * steps.max():.0f} mm apart, more than "
+                f"{1e3 * MAX_STEP_M:.0f} mm: what lies between them cannot be checked"
+            )
+        for rule in self._drawing_rules(joints):
+            index = int(np.argmax(rule.broken.any(axis=1)))
+            if rule.broken[index].any():
+                share = index / max(len(joints) - 1, 1)
+                who = rule.who[int(np.argmax(rule.broken[index]))]
+                raise MotionRefused(f"stroke refused at {share:.0%} of its way: {who} {rule.what}")
+
+    def _drawing_rules(self, joints: Array) -> list[Rule]:
+        pen = self.pen
+        if pen is None:
+            raise MotionRefused("this guard knows no pen: nothing may touch the table")
+        rules = [_without_pen(rule) if rule.what == TABLE else rule for rule in self.rules(joints)]
+        tips = pen.tips(self.arm.forward(joints))
+        height = tips[:, 2] - self.scene.table_height
+        deep, low = height < -pen.travel, height < self.clearance
+        off = low & ~pen.on_sheet(tips[:, :2])
+        return [
+            *rules,
+            Rule("is pushed in further than its holder gives way", ("the pen",), deep[:, None]),
+            Rule("comes down beside the sheets", ("the pen",), off[:, None]),
+        ]
 
     def rules(self, joints: Array) -> list[Rule]:
         """All rules, looked at in joints (n, 6)."""
@@ -198,7 +258,7 @@ class Guard:
         height = centres[..., 2] - scene.table_height
         rules = [
             Rule("leaves the workspace box", self._who, room < reach),
-            Rule("comes too near to the table", self._who, height < reach),
+            Rule(TABLE, self._who, height < reach),
         ]
         for keepout in scene.keepouts:
             away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
@@ -220,6 +280,11 @@ class Guard:
             one, other = spheres[a][some], spheres[b][some]
             near[some, k] = _meet(one, self.bodies[a].radii, other, self.bodies[b].radii)
         return Rule("meet", self._pair_names, near)
+
+
+def _without_pen(rule: Rule) -> Rule:
+    others = np.array([who != PEN for who in rule.who])
+    return Rule(rule.what, rule.who, rule.broken & others)
 
 
 def _pairs(bodies: tuple[Body, ...]) -> list[tuple[int, int]]:
@@ -266,83 +331,12 @@ def guard_of(config: CellConfig) -> Guard:
             ("projector", np.array(config.projector.pose.position_m), radius),
         ),
     )
-    return Guard(model, bodies, scene, space.clearance_m, float(np.radians(space.joint_margin_deg)))
+    sheets = np.array([(s.min_m, s.max_m) for s in config.sheets]).reshape(-1, 2, 2)
+    pen = Pen(np.array(bracket.pen.tip_m), bracket.pen.travel_m, sheets)
+    margin = float(np.radians(space.joint_margin_deg))
+    return Guard(model, bodies, scene, space.clearance_m, margin, pen)
 
 
 def _hull(name: str, hull: Box) -> Body:
     low, high = np.array(hull.min_m), np.array(hull.max_m)
     return box_body(name, JOINTS, (low + high) / 2, high - low)
-
-
-class GuardedRobot:
-    """A Robot whose every motion is allowed by a person and by the guard, and capped in speed.
-
-    `permission()` raises NotEnabled when motion is not allowed now.
-    """
-
-    def __init__(
-        self, robot: Robot, guard: Guard, config: CellConfig, permission: Callable[[], None]
-    ) -> None:
-        self._robot, self.guard, self._permission = robot, guard, permission
-        self._joint_speed = float(np.radians(config.robot.joint_speed_deg_s))
-        self._tcp_speed = config.robot.tcp_speed_m_s
-
-    async def identity(self) -> Identity:
-        return await self._robot.identity()
-
-    async def read(self) -> RobotState:
-        return await self._robot.read()
-
-    async def state_at(self, t: float) -> RobotState:
-        return await self._robot.state_at(t)
-
-    async def check(self, path: Path) -> None:
-        """MotionRefused by the guard, from the measured joints, or by the controller."""
-        state = await self._robot.read()
-        await asyncio.to_thread(self.guard.check, state.joints, path)
-        await self._robot.check(path)
-
-    async def move(self, target: Target, *, timeout_s: float) -> RobotState:
-        """Guarded and capped; NotEnabled or MotionRefused before anything has moved."""
-        self._permission()
-        if not 0.0 < target.speed <= 1.0:
-            raise MotionRefused(f"speed fraction {target.speed} is not in (0, 1]")
-        state = await self._standing()
-        await asyncio.to_thread(self.guard.check, state.joints, target.path)
-        await self._robot.check(target.path)
-        speed = self._capped(state.joints, target)
-        self._permission()  # it may have ended while the robot was asked
-        return await self._robot.move(Target(target.path, speed), timeout_s=timeout_s)
-
-    async def stop(self, *, clean: bool) -> None:
-        await self._robot.stop(clean=clean)
-
-    async def _standing(self) -> RobotState:
-        """The measured state at standstill; an arm that still moves, as after a lost link, is
-        stopped first. MotionRefused when it goes on moving, or is not the arm of the config."""
-        state = await self._robot.read()
-        if state.standstill_s == 0.0:
-            await self._robot.stop(clean=True)
-            state = await self._robot.read()
-        if state.standstill_s == 0.0:
-            raise MotionRefused("the arm is moving though it was stopped; a path starts at rest")
-        self._recognise(state)
-        return state
-
-    def _recognise(self, state: RobotState) -> None:
-        """A guard for another arm, or for a flange that the controller has shifted, guards
-        nothing."""
-        expected = self.guard.arm.forward(state.joints)
-        off = invert(expected) @ state.T_world_flange.matrix
-        metres, turn = float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off)))
-        if metres > FLANGE_M or turn > FLANGE_DEG:
-            raise MotionRefused(
-                f"the controller reports its flange {1e3 * metres:.0f} mm and {turn:.1f} degrees "
-                f"from where a {self.guard.arm.name} with these joints has it: another arm than "
-                "the config says, or a TCP or base frame is set there; nothing has moved"
-            )
-
-    def _capped(self, start: Array, target: Target) -> float:
-        tip = self.guard.tip_speed(start, target.path, self._joint_speed)
-        cap = 1.0 if tip <= self._tcp_speed else self._tcp_speed / tip
-        return min(target.speed, cap)

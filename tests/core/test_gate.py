@@ -14,8 +14,9 @@ from cellctl.drivers.base import Target
 from cellctl.engine.active_run import ActiveRun
 from cellctl.errors import DeviceFault, NotEnabled
 from cellctl.gate import Gate
+from cellctl.guarded_robot import GuardedRobot
 from cellctl.messages import PromoteRequest
-from cellctl.motion import GuardedRobot, guard_of
+from cellctl.motion import guard_of
 from cellctl.permission import Permission, enable
 from cellctl.run import Procedure, Result
 from tests import cells

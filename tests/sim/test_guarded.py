@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cellctl.errors import MotionRefused, NotEnabled
-from cellctl.motion import GuardedRobot, guard_of
+from cellctl.guarded_robot import GuardedRobot
+from cellctl.motion import guard_of
 from cellctl.sim.link import Link
 from tests.postures import pen_at
 from tests.sim.worlds import config, devices, to, world
