@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from cellctl.config import CellConfig
 from cellctl.drivers.base import Camera, Projector, Robot
 from cellctl.motion import Guard
+from cellctl.store.sheets import SheetLedger
 
 
 class Solver(Protocol):
@@ -19,7 +20,8 @@ class Solver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """`robot` is the guarded one: every path that reaches a driver has passed `guard`."""
+    """`robot` is the guarded one: every path that reaches a driver has passed `guard`. `sheets`
+    knows where the paper is used up."""
 
     config: CellConfig
     guard: Guard
@@ -27,3 +29,4 @@ class Cell:
     camera: Camera
     projector: Projector
     solver: Solver
+    sheets: SheetLedger

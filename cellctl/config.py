@@ -201,13 +201,16 @@ class BoardMount(Section):
 class PenMount(Section):
     """The pen on the flange: `tip_m` as far as known, and the radius of its hull. Its holder gives
     way by `travel_m` along the flange's z, and `feels_contact` if arm or holder can. `line_m` is
-    the width of the line that it draws."""
+    the width of the line that it draws. `posture_deg` are joints with the pen upright about over
+    the middle of the table: which branch of the arm draws, and which way round the tool then is.
+    World points are meant for that posture; without it, it is found from where the arm stands."""
 
     tip_m: Vector
     radius_m: Positive
     travel_m: Positive = 0.005
     line_m: Positive = 0.001
     feels_contact: bool = False
+    posture_deg: tuple[float, float, float, float, float, float] | None = None
 
 
 class BracketSection(Section):
@@ -235,6 +238,14 @@ class WorkspaceSection(Section):
     joint_margin_deg: float = Field(default=5.0, ge=0, lt=90)
 
 
+class PromotionSection(Section):
+    """When a calibration becomes the active one. "manual": when a person says so (`cellctl
+    promote`). "not-worse": also by itself, when it has passed and was measured to be no worse than
+    the active one."""
+
+    policy: Literal["manual", "not-worse"] = "manual"
+
+
 class CellConfig(Section):
     """One workcell."""
 
@@ -250,6 +261,7 @@ class CellConfig(Section):
     sheets: tuple[SheetSection, ...] = ()
     bracket: BracketSection
     workspace: WorkspaceSection
+    promotion: PromotionSection = PromotionSection()
 
     @model_validator(mode="after")
     def _only_simulations_are_enabled(self) -> CellConfig:

@@ -30,6 +30,7 @@ from cellctl.sim.drivers import SimCamera, SimProjector, SimRobot
 from cellctl.sim.launch import connect_or_start
 from cellctl.sim.link import SimClock
 from cellctl.store import Store
+from cellctl.store.sheets import SheetLedger
 from cellctl.worker.child import Child
 
 PRELOAD = ("cellctl.procedures", "cellctl.calib.patterns")
@@ -77,6 +78,7 @@ async def serve(config: CellConfig) -> AsyncIterator[Engine]:
             camera=camera,
             projector=devices.projector,
             solver=solver,
+            sheets=await store.in_order(SheetLedger, directory, store.in_order),
         )
         engine = Engine(cell, list(PROCEDURES.values()), store, gate)
         server = Server(

@@ -62,7 +62,7 @@ class Pen:
     def on_sheet(self, xy: Array) -> Mask:
         """Whether each of xy (n, 2) lies on a sheet."""
         inside = (xy[:, None] >= self.sheets[:, 0]) & (xy[:, None] <= self.sheets[:, 1])
-        return inside.all(axis=2).any(axis=1)
+        return np.logical_or.reduce(np.logical_and.reduce(inside, axis=2), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
