@@ -204,7 +204,7 @@ class Run:
         for name in (key, *images):
             _named("sample", name)
         if key in self.samples():
-            raise ValueError(f"{self._address(key)}: this sample was taken already")
+            raise ValueError(f"{self.address(key)}: this sample was taken already")
         step = self._current_step()
         await self._record.append_sample(address(self._scope, step), key, data, images)
         self._host.tell("sample", scope=self._scope, step=step, key=key)
@@ -225,11 +225,15 @@ class Run:
         The name is the same in every run, so that a sample that was cut short by a crash is
         taken again as the same one. Another attempt with other poses needs another key.
         """
-        token = SAMPLE.set(self._address(_named("sample", key)))
+        token = SAMPLE.set(self.address(_named("sample", key)))
         try:
             yield
         finally:
             SAMPLE.reset(token)
+
+    def address(self, key: str) -> str:
+        """`<scope>/<step>/<key>`: how a sample of the current step is called in the whole run."""
+        return address(self._scope, self._current_step(), key)
 
     async def checkpoint(self, text: str = "the next motion") -> None:
         """A place to stop at: lets the daemon work, raises CancelledError when the run is to end,
@@ -252,9 +256,6 @@ class Run:
     ) -> Any:
         """Evaluate a pure function in the solver's process; see `worker.Child.call`."""
         return await self._solver.call(function, *args, timeout_s=timeout_s)
-
-    def _address(self, key: str) -> str:
-        return address(self._scope, self._current_step(), key)
 
     def _current_step(self) -> str:
         if not self._step:

@@ -41,6 +41,8 @@ from cellctl.run import Procedure
 from cellctl.store.run_folder import RunFolder
 from cellctl.store.store import RunRecord, Store
 
+Policy = Callable[[Mapping[str, Any], Mapping[str, Any] | None], bool]
+
 log = structlog.get_logger(__name__)
 
 
@@ -48,8 +50,9 @@ class Engine:
     """What the bus talks to. All of it is called on the event loop.
 
     `gate` is what the robot of `cell` asks before it moves; the engine opens it for a run.
-    `promotes` is asked whether the calibration of a run that is done becomes the active one at
-    once; nobody but a person promotes, unless a policy is given here.
+    `promotes` is asked whether the calibration file that a run has left takes the place of the
+    active one (None: there is none) at once; nobody but a person promotes, unless a policy is
+    given here.
     """
 
     def __init__(
@@ -60,7 +63,7 @@ class Engine:
         gate: Gate,
         *,
         limits: Limits | None = None,
-        promotes: Callable[[Ending], bool] = lambda _: False,
+        promotes: Policy = lambda _new, _active: False,
     ) -> None:
         self.boot = secrets.token_hex(8)
         self._cell = cell
@@ -310,12 +313,23 @@ class Engine:
         await self._promote_by_policy(ending)
 
     async def _promote_by_policy(self, ending: Ending) -> None:
-        if ending.calibration_id is None or not self._promotes(ending):
+        new = ending.calibration_id
+        if new is None:
             return
         try:
-            await self._promote(ending.calibration_id, "policy", despite_failed_verdict=False)
+            if await self._store.in_order(self._promoted_by_policy, new):
+                self._tell_promoted(new, "policy")
         except CellctlError as error:
-            log.warning("not promoted", calibration=ending.calibration_id, error=error.message)
+            log.warning("not promoted", calibration=new, error=error.message)
+
+    def _promoted_by_policy(self, new: str) -> bool:
+        """In the store's thread, so that no other promotion comes in between."""
+        store = self._store.calibrations
+        active = store.info(store.active).document if store.active else None
+        if not self._promotes(store.info(new).document, active):
+            return False
+        store.promote(new, "policy", despite_failed_verdict=False)
+        return True
 
     def _info(self, folder: RunFolder) -> RunInfo:
         info = folder.info()
@@ -380,5 +394,8 @@ class Engine:
     async def _promote(self, calibration_id: str, client: str, **options: bool) -> None:
         promote = self._store.calibrations.promote
         await self._store.in_order(promote, calibration_id, client, **options)
+        self._tell_promoted(calibration_id, client)
+
+    def _tell_promoted(self, calibration_id: str, client: str) -> None:
         self._bulletin.event("promoted", calibration_id=calibration_id, client=client)
         self._tell_state()

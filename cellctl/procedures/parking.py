@@ -13,8 +13,8 @@ from cellctl.errors import MotionRefused
 from cellctl.geometry import Array, Transform
 from cellctl.ik import random_starts
 from cellctl.motion import Guard
+from cellctl.procedures.moving import go, gone, posture
 from cellctl.procedures.routing import Roadmap, shortened
-from cellctl.procedures.sweep import go, gone, posture
 from cellctl.run import Run
 
 MARGIN_M = 0.05
@@ -116,6 +116,22 @@ def lit_area(config: CellConfig) -> Array:
     half = np.array([width, height, 0.0]) / 2
     corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * half
     return pose.apply(corners)
+
+
+async def park_again(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> None:
+    """As `park`, but to the posture that this part of the run has parked in before, if it has."""
+    before = run.records(PARKED)
+    if not before or any(r["key"] == key for r in before):
+        await park(run, cell, T_world_camera, key)
+        return
+    await run.step(PARK)
+    if key in run.samples():
+        return
+    way = np.array(before[0]["way"])
+    await run.checkpoint("the arm moves out of the light")
+    async with run.taking(key):
+        _, taken = await go(run, cell, way[-1:], way)
+    await run.sample(key, {"way": taken.waypoints.tolist()})
 
 
 async def park(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> None:

@@ -17,13 +17,13 @@ from cellctl.config import CellConfig
 from cellctl.drivers.base import Stroke
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array, Mask, pose_matrix
-from cellctl.motion import Guard
+from cellctl.motion import PEN, Guard
 
 STEP_M = 1e-3
 """Between two points of a stroke."""
 OVERLAP_RAD = np.radians(12.0)
 """So far a circle goes on beyond its beginning, to be closed."""
-LIFT_SPARE_M = 0.01
+LIFT_SPARE_M = 0.018
 UP = np.array([0.0, 0.0, 1.0])
 DOWN = np.diag([1.0, -1.0, -1.0])
 STARTS = 24
@@ -93,15 +93,20 @@ def pen_rig(config: CellConfig, guard: Guard, surface: Surface, here: Array) -> 
 
     MotionRefused when the pen cannot stand upright over the middle of the table.
     """
-    pen, space = config.bracket.pen, config.workspace
+    pen = config.bracket.pen
     tip = np.array(pen.tip_m)
-    lift = space.clearance_m + 2 * pen.radius_m + LIFT_SPARE_M
     if pen.posture_deg is not None:
         posture = np.radians(pen.posture_deg)
         upright = _upright(guard.arm.forward(posture)[:3, :3], tip)
     else:
         posture, upright = _found_posture(config, guard, tip, here), DOWN
-    return PenRig(guard, tip, posture, upright, surface, pen.travel_m / 2, lift)
+    return PenRig(guard, tip, posture, upright, surface, pen.travel_m / 2, free_height(guard))
+
+
+def free_height(guard: Guard) -> float:
+    """So high over the table, metres, the tip stands freely, and a little more."""
+    radius = max(float(body.radii.max()) for body in guard.bodies if body.name == PEN)
+    return guard.clearance + radius + LIFT_SPARE_M
 
 
 def _upright(rotation: Array, tip: Array) -> Array:
@@ -156,7 +161,7 @@ def stroke(rig: PenRig, tips: Array, yaw: float, speed_m_s: float) -> Stroke:
     return Stroke(joints, speed_m_s)
 
 
-def lifted(guard: Guard, here: Array, lift: float, speed_m_s: float) -> Stroke | None:
+def lifted(guard: Guard, here: Array, speed_m_s: float) -> Stroke | None:
     """Straight up from joints `here` (6,), as the tool is turned, until the arm stands freely.
 
     None when it stands freely already, or when that would not be allowed.
@@ -164,6 +169,7 @@ def lifted(guard: Guard, here: Array, lift: float, speed_m_s: float) -> Stroke |
     if guard.pen is None or guard.free(here[None])[0] or not guard.draws(here[None])[0]:
         return None
     flange = guard.arm.forward(here)
+    lift = free_height(guard) + guard.pen.travel
     count = int(np.ceil(lift / STEP_M)) + 1
     poses = np.tile(flange, (count, 1, 1))
     poses[:, 2, 3] += np.linspace(0.0, lift, count)

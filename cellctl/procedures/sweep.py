@@ -18,19 +18,19 @@ from cellctl.calib.printed import Unseen
 from cellctl.calib.targets import Board
 from cellctl.calib.views import RobotView
 from cellctl.cell import Cell
-from cellctl.drivers.base import Path, RobotState, Target
+from cellctl.drivers.base import Path
 from cellctl.errors import MotionRefused, SolveError
 from cellctl.geometry import Array
 from cellctl.motion import Guard
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits, Shot, darken, shoot
+from cellctl.procedures.moving import go, posture
 from cellctl.procedures.observations import journalled, observation
 from cellctl.procedures.planning import (
     SEARCH_CHOICES,
     Spread,
     first_reached,
     plan_sweep,
-    reach,
     search_views,
 )
 from cellctl.procedures.rig import PlannedView
@@ -40,7 +40,6 @@ from cellctl.store.history import Sample
 SEARCH_ATTEMPTS, SEARCH_SEEDS = 4, 1000
 SEARCH_EDGE = 0.05
 """Share of the picture's width that a board keeps from its border while little is known."""
-MOVE_TIMEOUT_S = 120.0
 SEARCH, PLAN, VIEWS = "search", "plan", "views"
 
 
@@ -121,20 +120,6 @@ def _found(run: Run, board: Board) -> list[RobotView]:
 def _visited(samples: Mapping[str, Sample]) -> Array:
     """The postures (n, 6) that a search has been in."""
     return np.array([s.data["way"][-1] for s in samples.values()]).reshape(-1, JOINTS)
-
-
-def gone(run: Run) -> Array:
-    """Corners (n, 6) of all that the arm has gone along in this run, oldest first."""
-    steps = run.all_samples().values()
-    ways = [s.data["way"] for step in steps for s in step.values() if "way" in s.data]
-    return np.array([corner for way in ways for corner in way]).reshape(-1, JOINTS)
-
-
-async def posture(run: Run, cell: Cell) -> Array:
-    """Where plans start, joints (6,): the posture that this run has sent the arm to last, or where
-    it stands. A resumed run, whose arm may stand somewhere else, plans as it would have."""
-    corners = gone(run)
-    return corners[-1] if len(corners) else (await cell.robot.read()).joints
 
 
 def next_search(
@@ -227,18 +212,6 @@ def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
         "t": shot.state.t,
         **observation(shot.detection),
     }
-
-
-async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
-    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6);
-    the settled state and that path. MotionRefused when there is none."""
-    here = (await cell.robot.read()).joints
-    path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
-    if path is None:
-        degrees = ", ".join(f"{v:.1f}" for v in np.degrees(way[-1]))
-        raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")
-    timeout_s = MOVE_TIMEOUT_S / run.speed
-    return await cell.robot.move(Target(path, run.speed), timeout_s=timeout_s), path
 
 
 def _view_data(view: PlannedView) -> dict[str, Any]:

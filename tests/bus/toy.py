@@ -29,6 +29,7 @@ from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
 from cellctl.store import Store
+from cellctl.store.sheets import SheetLedger
 from tests import cells
 
 CELL = "toy"
@@ -99,6 +100,12 @@ class Still:
     async def move(self, target: base.Target, *, timeout_s: float) -> base.RobotState:
         raise DeviceFault("it does not move")
 
+    async def draw(self, stroke: base.Stroke, *, timeout_s: float) -> base.StrokeResult:
+        raise DeviceFault("it has no motors")
+
+    async def touch(self, stroke: base.Stroke, *, timeout_s: float) -> base.RobotState:
+        raise DeviceFault("it has no motors")
+
     async def stop(self, *, clean: bool) -> None:
         return
 
@@ -119,8 +126,9 @@ async def toy_engine(directory: Path) -> AsyncIterator[Engine]:
     config = parse_config(document, "toy")
     still = Still()
     guard = guard_of(config)
-    cell = Cell(config, guard, still, still, still, still)
     store = await Store.open(directory)
+    sheets = SheetLedger(directory, store.in_order)
+    cell = Cell(config, guard, still, still, still, still, sheets)
     engine = Engine(cell, PROCEDURES, store, Gate(Permission(directory)))
     try:
         yield engine

@@ -106,7 +106,7 @@ async def test_promotion(toy):
 
 
 async def test_a_policy_may_promote_what_passed(tmp_path):
-    async with bench(tmp_path, promotes=lambda ending: ending.verdict == "pass") as toy:
+    async with bench(tmp_path, promotes=lambda new, active: new["verdict"] == "pass") as toy:
         good = await toy.ended(await toy.start("survey"))
         await toy.until(lambda: toy.engine.state().active_calibration == good.calibration_id)
         await toy.ended(await toy.start("survey", "request-2", scale=-1.0))
@@ -114,7 +114,7 @@ async def test_a_policy_may_promote_what_passed(tmp_path):
 
 
 async def test_a_policy_that_is_refused_harms_nothing(tmp_path):
-    async with bench(tmp_path, promotes=lambda _: True) as toy:
+    async with bench(tmp_path, promotes=lambda new, active: True) as toy:
         await toy.ended(await toy.start("survey", scale=-1.0))
         assert toy.engine.state().active_calibration is None
         await toy.ended(await toy.start("survey", "request-2"))

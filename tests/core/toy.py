@@ -22,7 +22,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from cellctl.arms import arm
 from cellctl.cell import Cell, Solver
 from cellctl.config import parse_config
-from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, RobotState, Target
+from cellctl.drivers.base import (
+    SAMPLE,
+    Frame,
+    Identity,
+    Image,
+    RobotState,
+    Stroke,
+    StrokeResult,
+    Target,
+)
 from cellctl.drivers.base import Path as Joints
 from cellctl.engine import Engine
 from cellctl.engine.active_run import Limits
@@ -45,6 +54,7 @@ from cellctl.permission import Permission
 from cellctl.run import Procedure, Result, Run
 from cellctl.store import Store
 from cellctl.store.journal import Entry, read
+from cellctl.store.sheets import SheetLedger
 from cellctl.worker.child import Child
 from tests import cells
 from tests.core import functions
@@ -105,6 +115,13 @@ class ToyRobot:
             await asyncio.sleep(PERIOD_S)
             step = SPEED_RAD_S * speed * PERIOD_S
             self.joints += np.clip(way, -step, step)
+
+    async def draw(self, stroke: Stroke, *, timeout_s: float) -> StrokeResult:
+        state = await self.move(Target(Joints(stroke.joints)), timeout_s=timeout_s)
+        return StrokeResult(np.full(len(stroke.joints), state.t), stroke.joints, state)
+
+    async def touch(self, stroke: Stroke, *, timeout_s: float) -> RobotState:
+        return await self.move(Target(Joints(stroke.joints)), timeout_s=timeout_s)
 
     async def stop(self, *, clean: bool) -> None:
         self.stops.append(clean)
@@ -412,7 +429,8 @@ async def bench(
         store = await Store.open(directory)
         stack.push_async_callback(store.close)
         devices = (robot, ToyCamera(), ToyProjector())
-        cell = Cell(config, guard_of(config), *devices, solver)
+        sheets = SheetLedger(directory, store.in_order)
+        cell = Cell(config, guard_of(config), *devices, solver, sheets)
         gate = Gate(Permission(directory, always=enabled))
         robot.allowed = gate.require
         engine = Engine(cell, procedures, store, gate, limits=limits, **options)
