@@ -17,7 +17,7 @@ from cellctl.sim.bodies import plate_points, sheet
 from cellctl.sim.grid import touched_height
 from cellctl.sim.presets import Preset
 from cellctl.sim.textures import description
-from cellctl.sim.truth import STREAMS, Truth, draw, tape_error
+from cellctl.sim.truth import STREAMS, Truth, draw, sheet_rectangle, tape_error
 
 HULL_MARGIN_M, HULL_DEPTH_M = 0.02, 0.02
 LATENCY_SIGMAS = 6.0
@@ -47,6 +47,9 @@ latency_s is display to glass, margin included.""",
 world frame, from touching it with the pen. area_m: what is calibrated and drawn in (x, y).""",
     "bracket.checkerboard": """One bracket on the flange carries both boards and the pen. pose is
 T_flange_board, by tape. The hull is in the flange frame and surely contains board and holder.""",
+    "sheets": """Paper on the table, along the world's x and y: where the pen may be down.""",
+    "bracket.pen": """tip_m: in the flange frame, as far as known. Its holder gives way by travel_m
+along the flange's z. line_m: width of the line that it draws.""",
     "workspace": """Where the arm and all that it carries may be. clearance_m is kept from the
 table and the keep-outs, device_radius_m around camera and projector.""",
 }
@@ -82,9 +85,10 @@ def cell_document(preset: Preset, seed: int) -> dict[str, Any]:
         "camera": _camera(truth, rng) | {"pose": taped["camera"]},
         "projector": _projector(preset) | {"pose": taped["projector"]},
         "table": _table(preset, height) | {"pose": taped["table"]},
+        "sheets": [_sheet(preset)],
         "bracket": {
             **{name: _mount(truth, name, taped[name]) for name in boards},
-            "pen": {"tip_m": truth.nominal_pen.tolist(), "radius_m": 0.01},
+            "pen": _pen(truth),
         },
         "workspace": _workspace(truth, height),
     }
@@ -111,6 +115,21 @@ def _camera(truth: Truth, rng: np.random.Generator) -> dict[str, Any]:
 
 def _table(preset: Preset, height: float) -> dict[str, Any]:
     return {"touched_height_m": round(height, 5), "area_m": list(preset.table.area_m)}
+
+
+def _sheet(preset: Preset) -> dict[str, Any]:
+    low, high = sheet_rectangle(preset)
+    return {"name": "A", "min_m": _rounded(low, 4), "max_m": _rounded(high, 4)}
+
+
+def _pen(truth: Truth) -> dict[str, Any]:
+    return {
+        "tip_m": truth.nominal_pen.tolist(),
+        "radius_m": 0.01,
+        "travel_m": truth.preset.pen.travel_m,
+        "line_m": truth.preset.pen.line_m,
+        "feels_contact": True,
+    }
 
 
 def _projector(preset: Preset) -> dict[str, Any]:
@@ -195,8 +214,9 @@ def _emit(table: dict[str, Any], path: str, lines: list[str]) -> None:
         if isinstance(value, dict):
             _emit(value, inner, lines)
         elif _is_tables(value):
-            for item in value:
-                lines += ["", f"[[{inner}]]"]
+            for i, item in enumerate(value):
+                comment = COMMENTS.get(inner, "") if i == 0 else ""
+                lines += ["", *_comment(comment), f"[[{inner}]]"]
                 lines += [f"{k} = {_value(v)}" for k, v in item.items()]
 
 

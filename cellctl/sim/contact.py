@@ -1,7 +1,8 @@
 """When the arm, or what it carries, touches something: true hulls against the true cell.
 
 Hulls are sampled as balls: links along their axes, boards and tray on a grid. Links are not
-checked against each other, but what the bracket carries is checked against the links.
+checked against each other, but what the bracket carries is checked against the links. The pen may
+be pressed onto the table as far as its holder gives way.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ SWUNG = ("tray", "pen")
 
 @dataclass(frozen=True, eq=False)
 class Balls:
-    """Sample points (n, 3) of one body in its DH frame `frame`, and their radius."""
+    """Sample points (n, 3) of one body in its DH frame `frame`, and their radius; `pressed`
+    (n, 3) are the points when the body is pressed onto the table."""
 
     name: str
     frame: int
     points: Array
     radius: float
+    pressed: Array
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ class Obstacles:
 
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
-        self._balls = [_balls(body) for body in bodies(truth) if body.frame > 0]
+        travel = truth.preset.pen.travel_m
+        self._balls = [_balls(body, travel) for body in bodies(truth) if body.frame > 0]
 
     def gaps(self, frames: Array) -> tuple[Array, list[tuple[str, str]]]:
         """Gaps (n, pairs) at true link frames (n, 7, 4, 4), and the names of the pairs."""
@@ -56,6 +60,9 @@ class Obstacles:
             for name, gap in self._around(points).items():
                 columns.append(gap - balls.radius)
                 names.append((balls.name, name))
+            pressed = _moved(frames[:, balls.frame], balls.pressed)
+            columns.append(self._above_table(pressed).min(axis=1) - balls.radius)
+            names.append((balls.name, "table"))
             if balls.name in SWUNG:
                 columns.append(self._to_links(points, frames) - balls.radius)
                 names.append((balls.name, "arm"))
@@ -68,15 +75,13 @@ class Obstacles:
         return Contact(float(gaps[0, pair]), names[pair])
 
     def _around(self, points: Array) -> dict[str, Array]:
-        """Gaps (n,) from points (n, k, 3) in the world to table, camera and projector."""
+        """Gaps (n,) from points (n, k, 3) in the world to camera and projector."""
         truth = self._truth
         bodies_at = {"camera": truth.camera.pose, "projector": truth.projector.pose}
-        gaps = {
+        return {
             name: _distance(points, pose.translation).min(axis=1) - truth.preset.body_radius_m
             for name, pose in bodies_at.items()
         }
-        gaps["table"] = self._above_table(points).min(axis=1)
-        return gaps
 
     def _above_table(self, points: Array) -> Array:
         """Height (...,) over the table top; beside it, the distance to its upper edge."""
@@ -98,11 +103,13 @@ class Obstacles:
         return gaps
 
 
-def _balls(body: Body) -> Balls:
+def _balls(body: Body, pen_travel: float) -> Balls:
     if isinstance(body.shape, Plate):
-        points = plate_points(body.shape, SHEET_SPACING_M)
-        return Balls(body.name, body.frame, points, SHEET_RADIUS_M)
-    return Balls(body.name, body.frame, _along(body.shape), body.shape.radius)
+        points, radius = plate_points(body.shape, SHEET_SPACING_M), SHEET_RADIUS_M
+    else:
+        points, radius = _along(body.shape), body.shape.radius
+    shorter = (0.0, 0.0, pen_travel if body.name == "pen" else 0.0)
+    return Balls(body.name, body.frame, points, radius, points - shorter)
 
 
 def _along(capsule: Capsule) -> Array:

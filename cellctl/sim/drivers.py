@@ -10,9 +10,19 @@ from typing import Any
 import numpy as np
 
 from cellctl.config import CellConfig
-from cellctl.drivers.base import SAMPLE, Frame, Identity, Image, Path, RobotState, Target
+from cellctl.drivers.base import (
+    SAMPLE,
+    Frame,
+    Identity,
+    Image,
+    Path,
+    RobotState,
+    Stroke,
+    StrokeResult,
+    Target,
+)
 from cellctl.errors import BadInput, DeviceFault
-from cellctl.geometry import Transform
+from cellctl.geometry import Array, Transform
 from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.link import ANSWER_S, Link, SimClock
 
@@ -51,6 +61,7 @@ class SimRobot:
     def __init__(self, endpoint: Endpoint, config: CellConfig, clock: SimClock) -> None:
         self._link = Link("robot", endpoint.cell, clock)
         self._config, self._tally = config.robot, Tally()
+        self._feels_contact = config.bracket.pen.feels_contact
 
     async def identity(self) -> Identity:
         header, _ = await self._link.request("hello")
@@ -73,22 +84,36 @@ class SimRobot:
         `timeout_s` is cell time, and real time on top of what one answer may take. DeviceFault
         on a protective stop, a lost link, a timeout, or when the arm rests somewhere else.
         """
-        try:
-            await self._start(target)
-            state = await self._settled(timeout_s)
-        except asyncio.CancelledError:
-            await _finished(self.stop(clean=True))
-            raise
-        except TimeoutError as error:
-            await self.stop(clean=True)
-            raise DeviceFault(f"robot: {error}; the arm was stopped") from None
-        missed = float(np.abs(state.joints - target.path.waypoints[-1]).max())
-        if missed > GOAL_RAD:
-            raise DeviceFault(
-                f"robot: the arm stands {np.degrees(missed):.2f} degrees from its goal; "
-                "something else stopped it"
-            )
+        config = self._config
+        state = await self._carry_out(
+            "robot.move",
+            timeout_s,
+            waypoints=target.path.waypoints.tolist(),
+            joint_speed_rad_s=np.radians(config.joint_speed_deg_s) * target.speed,
+            tool_speed_m_s=config.tcp_speed_m_s,
+        )
+        _check_goal(state, target.path.waypoints[-1])
         return state
+
+    async def draw(self, stroke: Stroke, *, timeout_s: float) -> StrokeResult:
+        """As `Robot.draw`, with the care of `move`; measured at 125 Hz."""
+        state = await self._follow("robot.draw", stroke, timeout_s)
+        _check_goal(state, stroke.joints[-1])
+        _, blob = await self._link.request("robot.followed")
+        rows = np.frombuffer(blob).copy().reshape(-1, 1 + stroke.joints.shape[1])
+        return StrokeResult(rows[:, 0], rows[:, 1:], state)
+
+    async def touch(self, stroke: Stroke, *, timeout_s: float) -> RobotState:
+        """As `Robot.touch`, with the care of `move`. The arm stands still at the contact."""
+        if not self._feels_contact:
+            raise DeviceFault(
+                "robot: this cell's pen cannot feel a contact (bracket.pen.feels_contact is false)"
+            )
+        await self._follow("robot.touch", stroke, timeout_s)
+        header, _ = await self._link.request("robot.felt")
+        if header["felt"] is None:
+            raise DeviceFault("robot: no contact was felt until the end of the way")
+        return _state(header["felt"])
 
     async def stop(self, *, clean: bool) -> None:
         await self._link.request("robot.stop", hard=not clean)
@@ -100,16 +125,30 @@ class SimRobot:
     async def close(self) -> None:
         await self._link.close()
 
-    async def _start(self, target: Target) -> None:
+    async def _follow(self, verb: str, stroke: Stroke, timeout_s: float) -> RobotState:
         config = self._config
-        await self._link.request(
-            "robot.move",
-            waypoints=target.path.waypoints.tolist(),
-            joint_speed_rad_s=np.radians(config.joint_speed_deg_s) * target.speed,
-            joint_acceleration_rad_s2=np.radians(config.joint_acceleration_deg_s2),
-            tool_speed_m_s=config.tcp_speed_m_s,
-            **self._tally.next(),
+        return await self._carry_out(
+            verb,
+            timeout_s,
+            joints=stroke.joints.tolist(),
+            speed_m_s=min(stroke.speed_m_s, config.tcp_speed_m_s),
+            joint_speed_rad_s=np.radians(config.joint_speed_deg_s),
         )
+
+    async def _carry_out(self, verb: str, timeout_s: float, **arguments: Any) -> RobotState:
+        """Start a motion and wait for its end; cancelled or too late, the arm has been stopped."""
+        acceleration = np.radians(self._config.joint_acceleration_deg_s2)
+        try:
+            await self._link.request(
+                verb, joint_acceleration_rad_s2=acceleration, **arguments, **self._tally.next()
+            )
+            return await self._settled(timeout_s)
+        except asyncio.CancelledError:
+            await _finished(self.stop(clean=True))
+            raise
+        except TimeoutError as error:
+            await self.stop(clean=True)
+            raise DeviceFault(f"robot: {error}; the arm was stopped") from None
 
     async def _settled(self, timeout_s: float, *, faults: bool = True) -> RobotState:
         """Wait for standstill, in slices; DeviceFault on a fault, TimeoutError when too late."""
@@ -201,6 +240,15 @@ class SimProjector:
 
     async def close(self) -> None:
         await self._link.close()
+
+
+def _check_goal(state: RobotState, goal: Array) -> None:
+    missed = float(np.abs(state.joints - goal).max())
+    if missed > GOAL_RAD:
+        raise DeviceFault(
+            f"robot: the arm stands {np.degrees(missed):.2f} degrees from its goal; "
+            "something else stopped it"
+        )
 
 
 def _state(header: dict[str, Any]) -> RobotState:

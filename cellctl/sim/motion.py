@@ -1,7 +1,8 @@
 """How the arm moves: synchronised trapezoidal joint motion, true deceleration, and a ring after.
 
-All joints start and arrive together, along straight joint lines, and the arm stops at every
-waypoint. The controller reports what its encoders see. The true pose differs: the arm's own
+All joints start and arrive together. A move goes along straight joint lines and stops at every
+waypoint; a stroke goes through its waypoints without stopping, at constant speed of the tip. The
+controller reports what its encoders see. The true pose differs: the arm's own
 errors are in `Truth.arm`; each move has a repeatability error of its own; and for half a second
 after a deceleration the arm rings, of which the encoders see only a part.
 """
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from cellctl.arms import JOINTS, ArmModel
 from cellctl.geometry import Array
+from cellctl.sim.track import Curve, Straight, Track, thinned
 
 RING_S = 0.5
 RING_DECAY_S = 0.12
@@ -74,13 +76,13 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class Leg:
-    """From `start` (6,) along `delta` (6,) a unit of way to `goal` (6,), beginning at `t0`. The
+    """Along `track` from the way `begin` on to the joints `goal` (6,), beginning at `t0`. The
     pose error at the flange (translation m, rotation rad, (6,)) goes from `slip` to `next_slip`.
     A leg that is cut short by the next one has `cut` set and does not ring."""
 
     t0: float
-    start: Array
-    delta: Array
+    track: Track
+    begin: float
     goal: Array
     course: Course
     slip: Array
@@ -96,11 +98,16 @@ class Leg:
         way, speed = self.course.at(t - self.t0)
         share = np.clip((t - self.t0) / self.course.duration, 0.0, 1.0)[:, None]
         slip = self.slip + share * (self.next_slip - self.slip)
-        joints = self.start + way[:, None] * self.delta
+        joints, slope = self.track.at(self.begin + way)
         # Exactly there, whatever way led there: the same pose taken again is the same pose.
         there = (t >= self.end)[:, None]
         joints, slip = np.where(there, self.goal, joints), np.where(there, self.next_slip, slip)
-        return joints, speed[:, None] * self.delta, slip
+        return joints, speed[:, None] * slope, slip
+
+    def last_slope(self) -> Array:
+        """Change of the joints (6,) a unit of way where the leg ends."""
+        way = self.course.at(np.array([self.course.duration]))[0]
+        return self.track.at(self.begin + way)[1][0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +129,7 @@ class Motion:
         self._arm, self._true_arm = arms
         self._tool, self._ring = tool, 2 * np.pi * ring_hz
         nothing = np.zeros(JOINTS)
-        rest = Course(0.0, [(SETTLE_S, 0.0)])
-        self._legs = [Leg(t - SETTLE_S, home, nothing, home, rest, nothing, nothing)]
+        self._legs = [_settling(t - SETTLE_S, home, nothing, nothing)]
 
     def follow(self, now: float, waypoints: Array, limits: Limits, slip: Array) -> float:
         """Go through waypoints (n, 6) from where the arm stands; returns when it will stand
@@ -134,9 +140,25 @@ class Motion:
             after = slip if i == len(waypoints) - 1 else before
             delta = waypoint - joints
             course = self._course(joints, delta, limits)
-            self._legs.append(Leg(t, joints, delta, waypoint, course, before, after))
+            track = Straight(joints, delta)
+            self._legs.append(Leg(t, track, 0.0, waypoint, course, before, after))
             t, joints, before = self._legs[-1].end, waypoint, after
         return t
+
+    def trace(self, now: float, waypoints: Array, limits: Limits, slip: Array) -> float:
+        """As `follow`, but through the waypoints without stopping, at constant speed of the tip;
+        it is `slip` (6,) off from the beginning. MotionRefused when they are too far apart."""
+        joints, _, before = (a[0] for a in self._at(np.array([now])))
+        way = np.vstack([joints, waypoints])
+        tips = self._tips(way)
+        kept = thinned(way, tips)
+        curve = Curve(way[kept], tips[kept])
+        speed, acceleration = self._own(limits)
+        rate = curve.rate(speed, acceleration, limits.tool_speed)
+        course = Course.trapezoid(rate, curve.hardest(acceleration, rate))
+        settled = _settling(now, joints, before, slip)
+        self._legs += [settled, Leg(settled.end, curve, 0.0, way[-1], course, slip, slip)]
+        return self._legs[-1].end
 
     def stop(self, now: float, *, hard: bool) -> None:
         """Brake from `now`: as the move would have braked, or as hard as the arm can."""
@@ -144,15 +166,17 @@ class Motion:
         leg = self._legs[-1]
         if now >= leg.end:
             return
-        speed = float(leg.course.at(np.array([now - leg.t0]))[1][0])
-        joints, _, slip = (a[0] for a in leg.at(np.array([now])))
+        way, speed = (float(a[0]) for a in leg.course.at(np.array([now - leg.t0])))
+        slip = leg.at(np.array([now]))[2][0]
         gain = abs(leg.course.last_gain)
         if hard or gain == 0.0:
-            gain = float((self._arm.max_acceleration / np.maximum(np.abs(leg.delta), 1e-9)).min())
+            gain = leg.track.hardest(self._arm.max_acceleration, speed)
         course = Course(speed, [(max(speed / gain, 1e-6), -gain)])
         self._legs[-1] = replace(leg, cut=True)
-        goal = joints + float(course.at(np.array([course.duration]))[0][0]) * leg.delta
-        self._legs.append(Leg(now, joints, leg.delta, goal, course, slip, slip))
+        begin = leg.begin + way
+        end = begin + course.at(np.array([course.duration]))[0]
+        goal = leg.track.at(end)[0][0]
+        self._legs.append(Leg(now, leg.track, begin, goal, course, slip, slip))
 
     def standstill_at(self) -> float:
         """When the commanded motion ends, or ended."""
@@ -210,7 +234,7 @@ class Motion:
             on = (since >= 0) & (since < RING_S)
             if leg.cut or leg.course.last_gain >= 0 or not on.any():
                 continue
-            push = leg.delta * (-RING_GAIN * leg.course.last_gain / self._ring**2)
+            push = leg.last_slope() * (-RING_GAIN * leg.course.last_gain / self._ring**2)
             x = since[on, None]
             fade, left = np.exp(-x / RING_DECAY_S), 1 - x / RING_S
             sine, cosine = np.sin(self._ring * x), np.cos(self._ring * x)
@@ -223,11 +247,27 @@ class Motion:
         reach = np.maximum(np.abs(delta), 1e-12)
         if reach.max() < SETTLE_RAD:
             return Course(1.0 / SETTLE_S, [(SETTLE_S, 0.0)])
-        speed = np.minimum(limits.speed, self._arm.max_speed)
-        acceleration = np.minimum(limits.acceleration, self._arm.max_acceleration)
+        speed, acceleration = self._own(limits)
         steps = np.linspace(0.0, 1.0, 33)
-        flanges = self._arm.forward(start + steps[:, None] * delta)
-        tips = flanges[:, :3, :3] @ self._tool + flanges[:, :3, 3]
+        tips = self._tips(start + steps[:, None] * delta)
         fastest = np.linalg.norm(np.diff(tips, axis=0), axis=1).max() / steps[1]
         rate = min(float((speed / reach).min()), limits.tool_speed / max(float(fastest), 1e-9))
         return Course.trapezoid(rate, float((acceleration / reach).min()))
+
+    def _own(self, limits: Limits) -> tuple[Array, Array]:
+        """Joint speeds and accelerations (6,) under these limits and the arm's own."""
+        return (
+            np.minimum(limits.speed, self._arm.max_speed),
+            np.minimum(limits.acceleration, self._arm.max_acceleration),
+        )
+
+    def _tips(self, joints: Array) -> Array:
+        """Where the controller believes the tool's tip (n, 3) at joints (n, 6)."""
+        flanges = self._arm.forward(joints)
+        return flanges[:, :3, :3] @ self._tool + flanges[:, :3, 3]
+
+
+def _settling(t: float, joints: Array, slip: Array, next_slip: Array) -> Leg:
+    """Brakes and servos settle anew at `joints` (6,)."""
+    rest = Course(0.0, [(SETTLE_S, 0.0)])
+    return Leg(t, Straight(joints, np.zeros(JOINTS)), 0.0, joints, rest, slip, next_slip)

@@ -20,6 +20,7 @@ from cellctl.sim.bodies import bodies
 from cellctl.sim.light import Beam, Light, Shadows, mixed
 from cellctl.sim.noise import NoiseBank
 from cellctl.sim.paint import BeamFor, Canvas, Painter, Placed
+from cellctl.sim.paper import Ink
 from cellctl.sim.presets import CameraPreset
 from cellctl.sim.region import Region
 from cellctl.sim.tabletop import Tabletop
@@ -59,8 +60,9 @@ class Optics:
         self._table_lit: tuple[object, LitTable] | None = None
         self._still: tuple[object, Array] | None = None
 
-    def expose(self, instants: tuple[Instant, ...]) -> Array:
+    def expose(self, instants: tuple[Instant, ...], ink: Ink = ()) -> Array:
         """The mean signal (h, w) float32 of an exposure, grey levels above the sensor's offset."""
+        self._take_in(ink)
         height, width = self._view.shape
         if len(instants) == 1:
             return self._still_signal(instants[0])[:height, :width]
@@ -68,6 +70,17 @@ class Optics:
         for instant in instants:
             cv2.scaleAdd(self._signal(instant), instant.share, total, dst=total)
         return total[:height, :width]
+
+    def _take_in(self, ink: Ink) -> None:
+        """Bring what is kept up to date where ink has come or gone."""
+        changed = self._table.take_in(ink)
+        if not changed:
+            return
+        self._still = None
+        if self._table_lit is not None:
+            _, table = self._table_lit
+            for region in changed:
+                table.radiance[region.slices] = self._table.lit(table.smooth, region)
 
     def _still_signal(self, instant: Instant) -> Array:
         """Of a cell in which nothing moves; kept, as pictures are taken several at a time."""
@@ -91,7 +104,7 @@ class Optics:
 
     def _light_table(self, light: Array | None) -> LitTable:
         if light is None:
-            return LitTable(None, None, self._table.ambient)
+            return LitTable(None, None, self._table.lit(None))
         smooth = self._blur(light)
         return LitTable(light, smooth, self._table.lit(smooth))
 
@@ -138,11 +151,13 @@ class Renderer:
         self._noise = NoiseBank(seed, (height, width), preset.noise_sigma)
         self._optics: tuple[Truth, Optics] | None = None
 
-    def picture(self, truth: Truth, instants: tuple[Instant, ...], index: str) -> Image:
+    def picture(
+        self, truth: Truth, instants: tuple[Instant, ...], index: str, ink: Ink = ()
+    ) -> Image:
         """The uint8 picture (h, w) of an exposure, with the sensor noise of `index`."""
         if self._optics is None or self._optics[0] is not truth:
             self._optics = truth, Optics(truth)
-        return self._noise.expose(self._optics[1].expose(instants), index)
+        return self._noise.expose(self._optics[1].expose(instants, ink), index)
 
 
 def _key(light: Light) -> object:

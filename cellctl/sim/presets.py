@@ -66,9 +66,23 @@ class ProjectorPreset:
 
 
 @dataclass(frozen=True)
+class PenPreset:
+    """The pen in its sprung holder: how far it gives way and how wide it writes. A touch is felt
+    when it is pushed in by `felt_m` +- `felt_sigma_m`; an operator's eye is good to
+    `eye_sigma_m`."""
+
+    travel_m: float = 5.0e-3
+    line_m: float = 0.8e-3
+    felt_m: float = 0.2e-3
+    felt_sigma_m: float = 0.03e-3
+    eye_sigma_m: float = 0.1e-3
+
+
+@dataclass(frozen=True)
 class TablePreset:
     """The table: centre of the lit area, the area on it that is drawn in, and the table top
-    around the same centre (all extents along the world's x and y)."""
+    around the same centre (all extents along the world's x and y). Paper lies on the drawn area
+    and `sheet_margin_m` around it."""
 
     centre_m: tuple[float, float, float]
     area_m: tuple[float, float]
@@ -77,6 +91,7 @@ class TablePreset:
     bow_m: float = 1.0e-3
     bow_off_centre: float = 0.15
     touched_height_off_m: float = 0.3e-3
+    sheet_margin_m: float = 0.040
 
 
 @dataclass(frozen=True)
@@ -106,6 +121,7 @@ class Preset:
     table: TablePreset
     boards: BoardPreset
     home_deg: tuple[float, float, float, float, float, float]
+    pen: PenPreset = PenPreset()
     pen_sigma_m: float = 0.5e-3
     pen_slip_sigma_m: float = 0.15e-3
     tape_off_m: float = 0.10

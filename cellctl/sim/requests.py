@@ -74,6 +74,28 @@ class RobotMove(Sampled):
     tool_speed_m_s: Positive
 
 
+class RobotDraw(Sampled):
+    """Start to follow joint rows (rad) without stopping, with the tip at `speed_m_s`."""
+
+    joints: Annotated[list[Joints], Field(min_length=1, max_length=5000)]
+    speed_m_s: Annotated[float, Field(gt=0, le=1.0)]
+    joint_speed_rad_s: Positive
+    joint_acceleration_rad_s2: Positive
+
+
+class RobotTouch(RobotDraw):
+    """As `robot.draw`, until the pen feels a contact."""
+
+
+class RobotFollowed(Request):
+    """What was measured during the last stroke or touch, at 125 Hz. The reply's blob are rows of
+    seven float64: t, joints."""
+
+
+class RobotFelt(Request):
+    """The state at which the last touch felt its contact; `felt` is null when it has not."""
+
+
 class RobotStop(Request):
     """Start to brake; `hard`: as hard as the arm can."""
 
@@ -143,3 +165,83 @@ class Slow(Request):
 
     seconds: Seconds
     count: int = Field(ge=0, le=100_000)
+
+
+Millimetres = Annotated[float, Field(ge=-1000, le=1000)]
+Shift = tuple[Millimetres, Millimetres, Millimetres]
+Metres = Annotated[float, Field(ge=-10, le=10)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+Name = Annotated[str, Field(min_length=1, max_length=32)]
+Strokes = Annotated[int, Field(ge=0, le=1_000_000)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Later(Request):
+    """It happens when `after_strokes` strokes have been drawn since the world began (touches do
+    not count), at once if they have: before the next motion that begins with the pen in the air,
+    and before the next stroke."""
+
+    after_strokes: Strokes = 0
+
+
+class PenSlip(Later):
+    """The pen slips in its holder, for good, by mm in the flange frame."""
+
+    shift_mm: Shift
+
+
+class PenDry(Later):
+    """No ink from then on."""
+
+
+class PenWeak(Later):
+    """In `count` strokes, ink for the first `share` of the way that the pen is down."""
+
+    share: Share
+    count: int = Field(default=1, ge=0, le=100_000)
+
+
+class PenOff(Request):
+    """From now on the pen is mounted off, by mm in the flange frame."""
+
+    shift_mm: Shift
+
+
+class Shrink(Later):
+    """Circles come out with `factor` times the commanded radius; 1 heals it."""
+
+    factor: float = Field(ge=0.1, le=2.0)
+
+
+class SheetMove(Later):
+    """A sheet is shifted by mm along the world's axes and turned about its middle."""
+
+    sheet: Name
+    shift_mm: tuple[Millimetres, Millimetres] = (0.0, 0.0)
+    turn_deg: Degrees = 0.0
+
+
+class SheetReplace(Later):
+    """A person lays fresh paper; `sheet` null: all sheets."""
+
+    sheet: Name | None = None
+
+
+class SheetPrint(Later):
+    """A person lays a form with print on it: frame, grid, circles, marks like text."""
+
+    sheet: Name
+
+
+class PendantJog(Request):
+    """A person moves the arm straight to joints (rad); answered when it stands there."""
+
+    joints: Joints
+
+
+class PendantPlace(Request):
+    """A person moves the arm until the true pen tip stands on a world point (m), with the flange
+    at that orientation (rpy about the fixed axes); answered when it stands there."""
+
+    point: tuple[Metres, Metres, Metres]
+    rpy_deg: tuple[Degrees, Degrees, Degrees]

@@ -1,4 +1,4 @@
-"""The arm as its controller and the world know it: moves, faults, and what it bumps into."""
+"""The arm as its controller and the world know it: moves, strokes, faults, and what it touches."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from cellctl.arms import JOINTS
 from cellctl.errors import DeviceFault, MotionRefused
 from cellctl.geometry import Array
 from cellctl.sim.contact import Obstacles
-from cellctl.sim.motion import TICK_S, Limits, Motion
+from cellctl.sim.motion import RING_S, TICK_S, Limits, Motion
 from cellctl.sim.noise import keyed
+from cellctl.sim.pen import NONE, Pen, Press
 from cellctl.sim.truth import Truth
 
 SERVO_SIGMA_RAD = 1e-5
@@ -21,6 +22,14 @@ GRAZE_M = 1e-3
 """An arm that was stopped by a contact may move on if the overlap does not grow by more."""
 
 
+WRITING_S = 0.004
+"""The pen's way is sampled this finely: 0.2 mm at 50 mm/s, half a micron off a small circle."""
+CLOSE_M = 0.02
+"""The pen is looked at closely when it is nearer to the table."""
+SLOW_LOOK_S = 0.032
+"""A stroke is slow: the rest of the arm is looked at less often than in a move."""
+
+
 @dataclass(frozen=True)
 class Collision:
     """A contact: when, between what, where the flange was (m, world)."""
@@ -28,6 +37,15 @@ class Collision:
     t: float
     between: tuple[str, str]
     flange_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What will stop a motion at `t`: a contact `between` two, or the one that a touch feels."""
+
+    t: float
+    between: tuple[str, str] | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +72,16 @@ class Arm:
         self._obstacles = Obstacles(truth)
         self._collisions: list[Collision] = []
         self._fault: tuple[float, str] | None = None
+        self._feels: float | None = None
+        self._felt: float | None = None
+        self._stroking, self._stroke = False, (t, t)
+        self.pen = Pen(truth)
 
-    def surround(self, truth: Truth) -> None:
-        """The things around the arm are now where `truth` says."""
-        self._obstacles = Obstacles(truth)
+    def surround(self, now: float, truth: Truth) -> None:
+        """From now on, the things around the arm and the pen on it are as `truth` says."""
+        self._truth, self._obstacles = truth, Obstacles(truth)
+        self.pen.belongs_to(truth)
+        self.look_ahead(now)
 
     def check(self, waypoints: Array) -> None:
         """MotionRefused when a waypoint is outside the controller's joint limits."""
@@ -69,24 +93,72 @@ class Arm:
 
     def move(self, now: float, waypoints: Array, limits: Limits, index: str) -> float:
         """Start a move; returns when the commanded motion ends. `index` keys what is random."""
-        if fault := self.fault(now):
-            raise DeviceFault(f"the arm does not move: {fault}")
-        if now < self._motion.standstill_at():
-            raise DeviceFault("the arm is moving already; stop it first")
-        self.check(waypoints)
+        self._ready(now, waypoints)
         rng = keyed(self._truth.seed, "move", index)
         goal = waypoints[-1] + rng.normal(0.0, SERVO_SIGMA_RAD, JOINTS)
-        self._motion.follow(now, np.vstack([waypoints[:-1], goal]), limits, self._slip(rng))
-        self._watch(now)
-        return self._motion.standstill_at()
+        slip = self._slip(rng, self._truth.preset.arm_errors.repeat_sigma_deg)
+        self._lift(now)
+        self._stroking = False
+        self._motion.follow(now, np.vstack([waypoints[:-1], goal]), limits, slip)
+        return self._foresee(now)
+
+    def place(self, now: float, waypoints: Array, limits: Limits, slip: Array) -> float:
+        """As `move`, by hand: it ends with the pose error `slip` (6,), which the person saw."""
+        self._ready(now, waypoints)
+        self._lift(now)
+        self._stroking = False
+        self._motion.follow(now, waypoints, limits, slip)
+        return self._foresee(now)
+
+    def draw(
+        self, now: float, waypoints: Array, limits: Limits, index: str, share: float = 1.0
+    ) -> float:
+        """Start a stroke; returns when it ends. Ink flows for `share` of its way on paper."""
+        self._ready(now, waypoints)
+        seed, preset = self._truth.seed, self._truth.preset
+        self._trace(now, waypoints, limits, index)
+        self.pen.way_left = np.inf
+        slipped = keyed(seed, "slip", index).normal(0.0, preset.pen_slip_sigma_m, 2)
+        self.pen.slip = np.array([*slipped, 0.0])
+        self.pen.stroke, self.pen.strokes = self.pen.strokes, self.pen.strokes + 1
+        if share < 1.0:
+            self.pen.weaken(self._press(now), share)
+        return self._foresee(now)
+
+    def touch(self, now: float, waypoints: Array, limits: Limits, index: str) -> float:
+        """Start a stroke that ends where the pen is felt to touch; returns when it ends."""
+        self._ready(now, waypoints)
+        self._lift(now)
+        self._trace(now, waypoints, limits, index)
+        pen = self._truth.preset.pen
+        self._feels = pen.felt_m + float(
+            keyed(self._truth.seed, "touch", index).normal(0.0, pen.felt_sigma_m)
+        )
+        return self._foresee(now)
+
+    def followed(self, now: float) -> tuple[Array, Array]:
+        """What was measured since the last stroke or touch began and until it ended, or `now`:
+        times (n,) and joints (n, 6)."""
+        began, end = self._stroke
+        newest = np.floor(min(now, end) / TICK_S + 1e-6)
+        t = np.arange(np.ceil(began / TICK_S), newest + 1) * TICK_S
+        return t, self._motion.encoders(t)[0]
+
+    def felt(self, now: float) -> Reading | None:
+        """What was measured when the last touch felt its contact; None when it has not."""
+        if self._felt is None or self._felt > now:
+            return None
+        return self.read_at(self._felt, now)
 
     def stop(self, now: float, *, hard: bool) -> None:
         """Brake. A contact that would have come later does not, unless braking leads to it."""
         self._collisions = [c for c in self._collisions if c.t <= now]
         if self._fault and self._fault[0] > now:
             self._fault = None
+        if self._felt is not None and self._felt > now:
+            self._felt = None
         self._motion.stop(now, hard=hard)
-        self._watch(now)
+        self.look_ahead(now)
 
     def protective_stop(self, now: float, reason: str) -> None:
         self.stop(now, hard=True)
@@ -143,25 +215,104 @@ class Arm:
         flange = self._truth.nominal_arm.forward(joints)
         return Reading(t, joints, speeds, flange, self._motion.standstill_s(tick), self.fault(now))
 
-    def _slip(self, rng: np.random.Generator) -> Array:
-        errors = self._truth.preset.arm_errors
-        turn = np.radians(errors.repeat_sigma_deg)
-        return rng.normal(0.0, 1.0, 6) * np.repeat([errors.repeat_sigma_m, turn], 3)
+    def _ready(self, now: float, waypoints: Array) -> None:
+        """DeviceFault or MotionRefused when no motion through `waypoints` may start."""
+        if fault := self.fault(now):
+            raise DeviceFault(f"the arm does not move: {fault}")
+        if now < self._motion.standstill_at():
+            raise DeviceFault("the arm is moving already; stop it first")
+        self.check(waypoints)
+        self._feels = None
 
-    def _watch(self, now: float) -> None:
-        """Find the first contact of the motion ahead; it will stop the arm, hard."""
-        if now >= self._motion.standstill_at():
+    def _trace(self, now: float, waypoints: Array, limits: Limits, index: str) -> None:
+        rng = keyed(self._truth.seed, "stroke", index)
+        off = rng.normal(0.0, SERVO_SIGMA_RAD, JOINTS)
+        slip = self._slip(rng, self._truth.preset.arm_errors.drawing_repeat_sigma_deg)
+        self._motion.trace(now, waypoints + off, limits, slip)
+        self._stroking, self._stroke, self._felt = True, (now, now), None
+        self.pen.unwrite(now)
+
+    def _slip(self, rng: np.random.Generator, turn_deg: float) -> Array:
+        shift = self._truth.preset.arm_errors.repeat_sigma_m
+        return rng.normal(0.0, 1.0, 6) * np.repeat([shift, np.radians(turn_deg)], 3)
+
+    def _lift(self, now: float) -> None:
+        """A motion that is no stroke begins: a pen that is in the air sits well again."""
+        if not self.pen_is_down(now):
+            self.pen.slip, self.pen.stroke = NONE, None
+
+    def pen_is_down(self, now: float) -> bool:
+        """Whether it touches the table."""
+        t = np.array([now])
+        return bool(self.pen.press(t, self._motion.frames(t)).depth[0] >= 0)
+
+    def look_ahead(self, now: float) -> None:
+        """Something has changed: see again where the motion leads, and what the pen writes."""
+        self.pen.unwrite(now)
+        press, since = self._press(now), now
+        while event := self._first_event(since, press):
+            self._motion.stop(event.t, hard=True)
+            self._happen(event)
+            press, since = self._press(now), event.t
+            if event.between:
+                break
+        self.pen.write(press)
+        if self._stroking:
+            self._stroke = self._stroke[0], self._motion.standstill_at()
+
+    def _foresee(self, now: float) -> float:
+        self.look_ahead(now)
+        return self._motion.standstill_at()
+
+    def _happen(self, event: Event) -> None:
+        if not event.between:
+            self._felt, self._feels = event.t, None
             return
-        times = np.arange(now, self._motion.standstill_at() + TICK_S, TICK_S)
-        frames = self._motion.frames(times)
-        gaps, pairs = self._obstacles.gaps(frames)
+        flange = self._motion.frames(np.array([event.t]))[0, JOINTS]
+        x, y, z = flange[:3, 3].tolist()
+        self._collisions.append(Collision(event.t, event.between, (x, y, z)))
+        self._fault = (event.t, f"protective stop: {event.reason}")
+
+    def _first_event(self, now: float, press: Press) -> Event | None:
+        """What will stop the motion ahead first."""
+        if now >= self._motion.standstill_at():
+            return None
+        events = [self._felt_at(press), self._bottoms_at(press), self._touches_at(now)]
+        return min((e for e in events if e and e.t >= now), key=lambda e: e.t, default=None)
+
+    def _felt_at(self, press: Press) -> Event | None:
+        t = press.first(self._feels) if self._feels is not None else None
+        return None if t is None else Event(t)
+
+    def _bottoms_at(self, press: Press) -> Event | None:
+        """The end of the holder's travel; who is beyond it already may not go on."""
+        if not len(press.t):
+            return None
+        travel, now = self._truth.preset.pen.travel_m, float(press.depth[0])
+        t = press.first(travel if now <= travel else now + GRAZE_M)
+        reason = "pen touched table: the pen holder is at the end of its travel"
+        return None if t is None else Event(t, ("pen", "table"), reason)
+
+    def _touches_at(self, now: float) -> Event | None:
+        """The first contact of anything else with anything."""
+        step = SLOW_LOOK_S if self._stroking else TICK_S
+        times = np.arange(now, self._motion.standstill_at() + step, step)
+        gaps, pairs = self._obstacles.gaps(self._motion.frames(times))
         touching = gaps < np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
         if not touching.any():
-            return
+            return None
         first = int(touching.any(axis=1).argmax())
         pair = pairs[int(np.where(touching[first], gaps[first], np.inf).argmin())]
-        x, y, z = frames[first, JOINTS, :3, 3].tolist()
-        t = float(times[first])
-        self._collisions.append(Collision(t, pair, (x, y, z)))
-        self._fault = (t, f"protective stop: {pair[0]} touched {pair[1]}")
-        self._motion.stop(t, hard=True)
+        return Event(float(times[first]), pair, f"{pair[0]} touched {pair[1]}")
+
+    def _press(self, now: float) -> Press:
+        """The pen from `now` to the end of the motion and its ring, as long as it is close."""
+        end = self._motion.standstill_at() + RING_S
+        coarse = np.arange(now, end + TICK_S, TICK_S) if now < end else np.empty(0)
+        close = self.pen.press(coarse, self._motion.frames(coarse)).depth > -CLOSE_M
+        if not close.any():
+            return Press(np.empty(0), np.empty((0, 2)), np.empty(0))
+        near = np.nonzero(close)[0]
+        first, last = max(near[0] - 1, 0), min(near[-1] + 1, len(coarse) - 1)
+        t = np.arange(coarse[first], coarse[last] + WRITING_S / 2, WRITING_S)
+        return self.pen.press(t, self._motion.frames(t))

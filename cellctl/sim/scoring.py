@@ -37,6 +37,13 @@ class Scorer:
         found: list[dict[str, Any]] = header["collisions"]
         return found
 
+    async def ink(self) -> list[dict[str, Any]]:
+        """What the strokes have left on the sheets: `stroke` (counted from the world's beginning),
+        `sheet`, `length_m`, `centre_m` in the world and `radius_m` of the circle."""
+        header, _ = await self._link.request("ink")
+        found: list[dict[str, Any]] = header["strokes"]
+        return found
+
     async def read(self) -> dict[str, Any]:
         """The true lenses, poses, boards, table and pen, as they are now."""
         header, _ = await self._link.request("read")

@@ -21,11 +21,12 @@ from typing import Any, Literal
 import structlog
 
 from cellctl.errors import BadInput, CellctlError
-from cellctl.sim.doors import DOORS, Cell, Session, answer
+from cellctl.sim.doors import DOORS, answer
 from cellctl.sim.endpoint import Endpoint, write_endpoint
 from cellctl.sim.optics import Renderer
 from cellctl.sim.pace import Paced, Stepped
 from cellctl.sim.presets import PRESETS
+from cellctl.sim.session import Cell, Session
 from cellctl.sim.truth import draw
 from cellctl.sim.wire import HOST, BrokenFrame, pack, read_frame
 from cellctl.sim.world import World

@@ -1,4 +1,4 @@
-"""The table as the camera sees it: everything about it that neither moves nor changes.
+"""The table as the camera sees it: what neither moves nor changes, and the ink on it.
 
 Radiance is in grey levels above the sensor's pedestal; light is linear, 1 = the projector's
 white at the middle of its image.
@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 
 from cellctl.geometry import Array
+from cellctl.sim.inking import Inking, paper
 from cellctl.sim.noise import keyed
+from cellctl.sim.paper import Ink
 from cellctl.sim.region import NOWHERE, Region
 from cellctl.sim.truth import Truth
 from cellctl.sim.view import TILE, View, dense
@@ -18,7 +20,7 @@ from cellctl.sim.view import TILE, View, dense
 AMBIENT, PROJECTOR = 0.55, 0.45
 """What a white sheet reflects of the room's and of the projector's light; 1 saturates."""
 WHITE = 255.0
-TABLE_ALBEDO, FLOOR_ALBEDO, MOTTLE = 0.75, 0.12, 0.015
+TABLE_ALBEDO, PAPER_ALBEDO, FLOOR_ALBEDO, MOTTLE = 0.75, 0.79, 0.12, 0.015
 GLARE_PEAK, GLARE_WIDTH = 220.0, 0.012
 PIXEL_BOX_VARIANCE = 1.0 / 12.0
 
@@ -50,22 +52,44 @@ def room_light(truth: Truth, view: View) -> Array:
 
 
 class Tabletop:
-    """Static layers (padded h, w): `ambient` radiance, `gain` of projected light, `depth`."""
+    """Layers (padded h, w): `ambient` radiance, `gain` of projected light, `depth`. The first two
+    are changed where ink is taken in, and nowhere else."""
 
     def __init__(self, truth: Truth, view: View) -> None:
         self._truth, self._view = truth, view
+        self._inking: Inking | None = None
         u, v, self.depth, strength, *places = dense(self._look, view.padded, TILE)
         albedo = self._albedo(*places)
         self.ambient = (
             np.float32(WHITE * AMBIENT) * room_light(truth, view) * albedo + self._glare()
         )
         self.gain = np.float32(WHITE * PROJECTOR) * albedo * strength
-        self._maps = u, v
+        self._blank = self.ambient, self.gain
+        self._maps, self._places = (u, v), (places[0], places[1])
         self.defocus = self._defocus()
 
-    def lit(self, smooth: Array, region: Region | None = None) -> Array:
-        """Radiance of the table under the light `smooth` (projector h, w), of a camera region."""
+    def take_in(self, ink: Ink) -> list[Region]:
+        """Show this ink and no other; returns where the layers have changed."""
+        if not ink and self._inking is None:
+            return []
+        changed: list[Region] = []
+        if self._inking is None or self._inking.holds_more(ink):
+            self._inking = Inking(self._truth, self._places)
+            self.ambient, self.gain = (layer.copy() for layer in self._blank)
+            changed.append(Region(0, 0, *self.ambient.shape[::-1]))
+        for region in self._inking.add(ink):
+            part = region.slices
+            for layer, blank in zip((self.ambient, self.gain), self._blank, strict=True):
+                np.multiply(blank[part], self._inking.left[part], out=layer[part])
+            changed.append(region)
+        return changed
+
+    def lit(self, smooth: Array | None, region: Region | None = None) -> Array:
+        """Radiance of the table under the light `smooth` (projector h, w; None: dark), of a camera
+        region."""
         part = (slice(None), slice(None)) if region is None else region.slices
+        if smooth is None:
+            return self.ambient[part].copy()
         u, v = (m[part] for m in self._maps)
         light: Array = cv2.remap(smooth, u, v, cv2.INTER_LINEAR)
         light *= self.gain[part]
@@ -95,17 +119,21 @@ class Tabletop:
         return np.concatenate([lit, depth[..., None], strength[..., None], places], axis=-1)
 
     def _albedo(self, x: Array, y: Array) -> Array:
-        """White matt sheet, slightly mottled, on a floor that is darker and far away."""
+        """Paper on a matt top, slightly mottled, on a floor that is darker and far away."""
         pixel = self._truth.preset.camera.height_m * self._view.pixel
         hx, hy = self._truth.table.half_top.astype(np.float32)
         inside = np.minimum(hx - np.abs(x), hy - np.abs(y))
-        on_top = np.clip(inside / np.float32(pixel) + np.float32(0.5), 0, 1)
+        on_top, on_paper = (
+            np.clip(margin / np.float32(pixel) + np.float32(0.5), 0, 1)
+            for margin in (inside, paper(self._truth.sheets, x, y))
+        )
         rows, columns = self._view.padded
         rng = keyed(self._truth.seed, "mottle", "")
         blotches = rng.standard_normal((rows // 6, columns // 6), dtype=np.float32)
         mottle = cv2.resize(blotches, (columns, rows), interpolation=cv2.INTER_CUBIC)
-        sheet = np.float32(TABLE_ALBEDO) * (1 + np.float32(MOTTLE) * mottle)
-        return np.float32(FLOOR_ALBEDO) + on_top * (sheet - np.float32(FLOOR_ALBEDO))
+        bright = np.float32(PAPER_ALBEDO - TABLE_ALBEDO) * on_paper + np.float32(TABLE_ALBEDO)
+        bright *= 1 + np.float32(MOTTLE) * mottle
+        return np.float32(FLOOR_ALBEDO) + on_top * (bright - np.float32(FLOOR_ALBEDO))
 
     def _glare(self) -> Array:
         """The lamp's reflection, somewhere in the lit area."""

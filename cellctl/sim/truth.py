@@ -14,6 +14,7 @@ import numpy as np
 from cellctl.arms import JOINTS, ArmModel, arm
 from cellctl.geometry import Array, Transform, look_down, pose_matrix
 from cellctl.sim.lens import Lens
+from cellctl.sim.paper import Sheet
 from cellctl.sim.presets import BoardPreset, CameraPreset, Preset, ProjectorPreset, TablePreset
 
 Rng = np.random.Generator
@@ -49,15 +50,20 @@ class Table:
         return self.bow * (1.0 - (uv**2).sum(-1) / 2.0)
 
     def hit(self, origin: Array, directions: Array) -> Array:
-        """Where rays from `origin` (3,) along `directions` (..., 3) meet the surface, world."""
+        """Where rays from `origin` (3,) or (..., 3) along `directions` (..., 3) meet the surface,
+        world."""
         inverse = self.pose.inverse()
         start = inverse.apply(origin)
         rays = directions @ inverse.rotation.T
-        points = start - rays * (start[2] / rays[..., 2:])
+        points = start - rays * (start[..., 2:] / rays[..., 2:])
         for _ in range(3):
             lift = (self.height(points[..., :2]) - points[..., 2]) / rays[..., 2]
             points = points + rays * lift[..., None]
         return self.pose.apply(points)
+
+    def surface(self, xy: Array) -> Array:
+        """World points (..., 3) on the surface at table xy (..., 2)."""
+        return self.pose.apply(np.concatenate([xy, self.height(xy)[..., None]], axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +123,7 @@ class Truth:
     pen: Array  # true pen tip in the flange frame (3,)
     nominal_pen: Array  # as the config states it (3,)
     ring_hz: float  # at which the arm rings when it has braked
+    sheets: tuple[Sheet, ...]  # paper on the table, upper ones last
 
     def light_lands(self, pixels: Array) -> Array:
         """World points (..., 3) on the table that projector pixels (..., 2) light."""
@@ -130,9 +137,7 @@ class Truth:
         """
         flange = self.arm.forward(joints)
         tips = flange[:, :3, :3] @ self.pen + flange[:, :3, 3]
-        axes = flange[:, :3, 2]
-        hits = [self.table.hit(tip, axis[None])[0] for tip, axis in zip(tips, axes, strict=True)]
-        return np.array(hits).reshape(len(xy), 3)
+        return self.table.hit(tips, flange[:, :3, 2]).reshape(len(xy), 3)
 
     def drawing_pose(self, xy: Array, height: float, yaw: float = 0.0) -> Array:
         """Nominal T_world_flange (n, 4, 4) with the pen straight down on (x, y, height)."""
@@ -164,6 +169,7 @@ def draw(preset: Preset, seed: int) -> Truth:
         pen=pen + rng["pen"].normal(0.0, preset.pen_sigma_m, 3),
         nominal_pen=pen,
         ring_hz=float(rng["ring"].uniform(*RING_HZ)),
+        sheets=(laid_sheet(preset, table, 0),),
     )
 
 
@@ -225,6 +231,22 @@ def _table(preset: TablePreset, projector: ProjectorPreset, rng: Rng) -> Table:
     bow = preset.bow_m * float(rng.choice((-1.0, 1.0)))
     turned = np.abs(turn[:2, :2].T) @ (np.array(preset.top_m) / 2)
     return Table(Transform("world", "table", pose), half, bow, off, turned)
+
+
+def sheet_rectangle(preset: Preset) -> tuple[Array, Array]:
+    """Lower and upper corner (2,) in world x, y of the paper as a person lays it."""
+    centre = np.array(preset.table.centre_m[:2])
+    half = np.array(preset.table.area_m) / 2 + preset.table.sheet_margin_m
+    return centre - half, centre + half
+
+
+def laid_sheet(preset: Preset, table: Table, number: int) -> Sheet:
+    """Paper as a person lays it, along the world's axes."""
+    low, high = sheet_rectangle(preset)
+    middle = (*((low + high) / 2), preset.table.centre_m[2])
+    along = table.pose.rotation.T[:2, 0]
+    turn = float(np.arctan2(along[1], along[0]))
+    return Sheet("A", number, table.pose.inverse().apply(middle)[:2], turn, (high - low) / 2)
 
 
 def _board(name: str, preset: BoardPreset, rng: Rng) -> Board:

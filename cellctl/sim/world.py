@@ -10,6 +10,7 @@ name and a count, so that a sample taken again is the same sample; without one t
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,9 @@ from cellctl.sim.camera import Capture, Stream
 from cellctl.sim.glass import Glass
 from cellctl.sim.motion import RING_S, Limits
 from cellctl.sim.optics import Instant
+from cellctl.sim.paper import Ink
 from cellctl.sim.robot import HISTORY_S, Arm
+from cellctl.sim.shrink import shrunk
 from cellctl.sim.truth import Device, Truth
 
 STILL_PX, STEP_PX, MOST_INSTANTS = 0.02, 0.5, 12
@@ -31,12 +34,24 @@ PROBES_M = ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (-0.4, 0.0, 0.0), (0.0, 0.25, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """A dequeued frame, not rendered yet: everything that its picture depends on but noise."""
+    """A dequeued frame, not rendered yet: everything that its picture depends on but noise. The
+    ink is that at its exposure's end."""
 
     capture: Capture
     exposure_s: float
     instants: tuple[Instant, ...]
     truth: Truth
+    ink: Ink
+
+
+@dataclass(eq=False)
+class Habits:
+    """How the next strokes come out: circles with `shrink` times their radius; for `weak` of them
+    the ink gives out after `share` of the way."""
+
+    shrink: float = 1.0
+    weak: int = 0
+    share: float = 1.0
 
 
 class World:
@@ -49,6 +64,8 @@ class World:
         self.arm = Arm(truth, t)
         self.stream = Stream(truth.preset.camera, t)
         self.glass = Glass(truth.seed, truth.preset.projector, t)
+        self.habits = Habits()
+        self._due: list[tuple[int, Callable[[], None]]] = []
 
     @property
     def truth(self) -> Truth:
@@ -64,6 +81,7 @@ class World:
         self.glass.forget(before)
         while len(self._truths) > 1 and self._truths[1][0] < before:
             del self._truths[0]
+            self.arm.pen.forget({s.number for _, truth in self._truths for s in truth.sheets})
 
     def index(self, stream: str, key: str | None) -> str:
         """The index under which something random is drawn from `stream`."""
@@ -74,7 +92,24 @@ class World:
 
     def move(self, waypoints: Array, limits: Limits, key: str | None = None) -> float:
         """Start a move through joint waypoints (n, 6); returns when it will end."""
+        self._meet_due()
         return self.arm.move(self.now, waypoints, limits, self.index("move", key))
+
+    def draw(self, waypoints: Array, limits: Limits, key: str | None = None) -> float:
+        """Start a stroke through joint waypoints (n, 6); returns when it will end."""
+        self._meet_due(stroke=True)
+        habits = self.habits
+        if habits.shrink != 1.0:
+            waypoints = shrunk(self.truth, waypoints, habits.shrink)
+        share = habits.share if habits.weak else 1.0
+        ends = self.arm.draw(self.now, waypoints, limits, self.index("stroke", key), share)
+        habits.weak = max(habits.weak - 1, 0)
+        return ends
+
+    def touch(self, waypoints: Array, limits: Limits, key: str | None = None) -> float:
+        """Start a stroke that ends where the pen feels a contact; returns when it will end."""
+        self._meet_due()
+        return self.arm.touch(self.now, waypoints, limits, self.index("touch", key))
 
     def show(self, image: Image, key: str | None = None) -> float:
         """Show an image; returns the time of the acknowledgement, before it is on the glass."""
@@ -89,7 +124,8 @@ class World:
         duration = self.truth.preset.camera.exposure_s
         truth = next(truth for since, truth in reversed(self._truths) if since <= capture.seen)
         instants = self._instants(truth, capture.seen, duration)
-        return Exposure(capture, duration, instants, truth)
+        ink = self.arm.pen.ink(capture.seen + duration)
+        return Exposure(capture, duration, instants, truth, ink)
 
     def noise_index(self, exposure: Exposure, key: str | None) -> str:
         """Under which the sensor noise of an exposure's picture is drawn."""
@@ -103,8 +139,31 @@ class World:
             moved = replace(self.truth, camera=_nudged(self.truth.camera, shift_m, turn_rad))
         else:
             moved = replace(self.truth, projector=_nudged(self.truth.projector, shift_m, turn_rad))
-        self._truths.append((self.now, moved))
-        self.arm.surround(moved)
+        self.become(moved)
+
+    def after_strokes(self, count: int, change: Callable[[], None]) -> None:
+        """Do `change` when `count` strokes have been drawn since the world began, at once if they
+        have: before the next motion that begins with the pen in the air, and before the next
+        stroke."""
+        if self.arm.pen.strokes >= count:
+            change()
+        else:
+            self._due.append((count, change))
+
+    def become(self, truth: Truth) -> None:
+        """From now on, `truth` is true."""
+        self._truths.append((self.now, truth))
+        self.arm.surround(self.now, truth)
+
+    def _meet_due(self, *, stroke: bool = False) -> None:
+        """What was planted for after some number of strokes happens now, if that is reached."""
+        if not self._due or not (stroke or not self.arm.pen_is_down(self.now)):
+            return
+        count = self.arm.pen.strokes
+        due = [change for after, change in self._due if after <= count]
+        self._due = [(after, change) for after, change in self._due if after > count]
+        for change in due:
+            change()
 
     def _instants(self, truth: Truth, t: float, duration: float) -> tuple[Instant, ...]:
         """The exposure from `t` on in parts short enough that nothing moves in one."""
