@@ -162,11 +162,13 @@ class SheetSection(Rectangle):
 
 class TableSection(Section):
     """`pose`: centre of the lit area, z up. `touched_height_m`: the table's height in the world
-    frame as the robot knows it, from touching it. `area_m`: what is calibrated and drawn in."""
+    frame as the robot knows it, from touching it. `area_m`: what is calibrated and drawn in.
+    `top`: the table's edges; without it the table has none, and the arm stays above its height."""
 
     pose: Pose
     touched_height_m: float
     area_m: tuple[Positive, Positive]
+    top: Rectangle | None = None
 
 
 class Box(Section):

@@ -9,12 +9,12 @@ config says, and a person's arm is not in the config.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cellctl.arms import JOINTS, ArmModel, arm
-from cellctl.config import Box, CellConfig
+from cellctl.config import Box, CellConfig, TableSection
 from cellctl.drivers.base import Path, Stroke
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array, Mask
@@ -33,6 +33,8 @@ PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
 PEN = "pen"
 TABLE = "comes too near to the table"
+ENDLESS = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+"""The top of a table whose edges nobody has stated."""
 SLACK_M, SLACK_RAD = 0.005, 0.005
 """Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
 
@@ -67,13 +69,27 @@ class Pen:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands around the arm, in the world frame, metres. `balls`: (name, centre, radius)."""
+    """What stands around the arm, in the world frame, metres. `balls`: (name, centre, radius).
+
+    The table is solid below `table_height`, within `table_top` (corners (2, 2), lowest first):
+    everywhere where that is infinite."""
 
     box_low: Array
     box_high: Array
     table_height: float
     keepouts: tuple[Keepout, ...]
     balls: tuple[tuple[str, Array, float], ...]
+    table_top: Array = field(default_factory=lambda: ENDLESS)
+
+    def near_table(self, centres: Array, reach: Array) -> Mask:
+        """Whether spheres at (n, m, 3) come nearer to the table than `reach` (m,): (n, m)."""
+        height = centres[..., 2] - self.table_height
+        near = height < reach
+        if not np.isinf(self.table_top).all() and near.any():
+            low, high = self.table_top
+            beside = np.maximum(low - centres[..., :2], centres[..., :2] - high).clip(min=0.0)
+            near &= (beside**2).sum(axis=-1) + height.clip(min=0.0) ** 2 < reach**2
+        return near
 
 
 @dataclass(frozen=True)
@@ -255,10 +271,10 @@ class Guard:
         free = [s for s, b in zip(spheres, self.bodies, strict=True) if b.frame >= FIRST_FREE_FRAME]
         centres = np.concatenate(free, axis=1)
         room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
-        height = centres[..., 2] - scene.table_height
+        on_table = scene.near_table(centres, self._reach)
         rules = [
             Rule("leaves the workspace box", self._who, room < reach),
-            Rule(TABLE, self._who, height < reach),
+            Rule(TABLE, self._who, on_table),
         ]
         for keepout in scene.keepouts:
             away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
@@ -323,6 +339,7 @@ def guard_of(config: CellConfig) -> Guard:
         box_low=np.array(space.box.min_m),
         box_high=np.array(space.box.max_m),
         table_height=config.table.touched_height_m,
+        table_top=_top(config.table),
         keepouts=tuple(
             Keepout(box.name, np.array(box.min_m), np.array(box.max_m)) for box in space.keep_outs
         ),
@@ -335,6 +352,10 @@ def guard_of(config: CellConfig) -> Guard:
     pen = Pen(np.array(bracket.pen.tip_m), bracket.pen.travel_m, sheets)
     margin = float(np.radians(space.joint_margin_deg))
     return Guard(model, bodies, scene, space.clearance_m, margin, pen)
+
+
+def _top(table: TableSection) -> Array:
+    return ENDLESS if table.top is None else np.array([table.top.min_m, table.top.max_m])
 
 
 def _hull(name: str, hull: Box) -> Body:

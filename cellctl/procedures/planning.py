@@ -7,7 +7,8 @@ spread-out set is picked: extremes first, so that corners of the image and steep
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,6 +35,8 @@ PLACING_ROUNDS = 3
 """Where a board appears depends on where it is: so often is its place in the picture put right."""
 BATCHES = 3
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+NEAR_M = 0.01
+"""Closer to the camera than this nothing is looked at."""
 SPIRAL_STEP = 0.07
 """Radius of the search spiral's first point, in image widths."""
 
@@ -50,6 +53,19 @@ class Spread:
     middle: float = 1.0
     edge_px: float = 12.0
     about_camera: bool = False
+
+
+def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
+    """The spread with its `fill` scaled down where the workspace box does not come near enough to
+    the camera for it: the largest is then what a board fills at the box's nearest corner."""
+    corners = itertools.product(*zip(guard.scene.box_low, guard.scene.box_high, strict=True))
+    depths = transform_points(invert(rig.T_world_camera), np.array(list(corners)))[:, 2]
+    side = np.ptp(rig.outline, axis=0).max()
+    largest = rig.camera.K[0, 0] * side / (max(depths.min(), NEAR_M) * rig.camera.image_size[0])
+    if largest >= spread.fill[1]:
+        return spread
+    low, high = spread.fill
+    return replace(spread, fill=(low * largest / high, largest))
 
 
 def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:
@@ -150,10 +166,12 @@ def search_views(
     """
     if not len(had):
         flat = Spread(tilt_deg=(0.0, 20.0), spin_deg=180.0, fill=(0.16, 0.28), middle=0.9)
+        flat = attainable(flat, rig, guard)
         views = feasible(rig, guard, candidates(rig, flat, SEARCH_CANDIDATES, seed), here, edge_px)
         return sorted(views, key=lambda view: _from_spiral(rig, view, step))
     steep = min(15.0 + 5.0 * len(had), 35.0)
     tilted = Spread(tilt_deg=(0.6 * steep, steep), fill=(0.18, 0.32), middle=0.5)
+    tilted = attainable(tilted, rig, guard)
     views = feasible(rig, guard, candidates(rig, tilted, SEARCH_CANDIDATES, seed), here, edge_px)
     if not views:
         return []
@@ -180,7 +198,7 @@ def plan_sweep(
 
     All can be reached from `here` (6,) over lines that the guard allows.
     """
-    guard = guard.cautious(here)
+    guard, spread = guard.cautious(here), attainable(spread, rig, guard)
     reached = _reachable_views(rig, guard, here, spread, count, seed)
     if spread.about_camera:
         chosen = about_camera(spread_out(rig, reached, 3 * count), count, seed)[: 2 * count]

@@ -74,5 +74,6 @@ def _tray(sheets: list[Plate]) -> Plate:
     corners = np.concatenate([plate_points(plate, spacing=10.0) for plate in sheets])
     low, high = corners.min(axis=0), corners.max(axis=0)
     pose = np.eye(4)
-    pose[2, 3] = high[2] + TRAY_BEHIND_M
+    behind = sheets[0].pose[2, 2]  # 1: the boards face backwards
+    pose[2, 3] = high[2] + TRAY_BEHIND_M if behind > 0 else low[2] - TRAY_BEHIND_M
     return Plate(pose, (low + high)[:2] / 2, (high - low)[:2] / 2)

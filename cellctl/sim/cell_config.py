@@ -114,7 +114,12 @@ def _camera(truth: Truth, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _table(preset: Preset, height: float) -> dict[str, Any]:
-    return {"touched_height_m": round(height, 5), "area_m": list(preset.table.area_m)}
+    table = {"touched_height_m": round(height, 5), "area_m": list(preset.table.area_m)}
+    if preset.table.centre_m[2] <= 0.0:
+        return table
+    centre, half = np.array(preset.table.centre_m[:2]), np.array(preset.table.top_m) / 2
+    corners = {"min_m": _rounded(centre - half, 2), "max_m": _rounded(centre + half, 2)}
+    return table | {"top": corners}
 
 
 def _sheet(preset: Preset) -> dict[str, Any]:
@@ -160,7 +165,21 @@ def _mount(truth: Truth, name: str, pose: dict[str, list[float]]) -> dict[str, A
 
 
 def _workspace(truth: Truth, height: float) -> dict[str, Any]:
-    """The arm's reach, but not beyond the table on the side away from its base."""
+    fence = truth.preset.fence
+    low, high, keep_outs = _before_mast(truth, height)
+    if fence is not None:
+        low, high, keep_outs = np.array(fence.low_m), np.array(fence.high_m), []
+    return {
+        "clearance_m": 0.03,
+        "device_radius_m": 0.12,
+        "joint_margin_deg": 5.0,
+        "box": {"min_m": _rounded(low, 2), "max_m": _rounded(high, 2)},
+        "keep_outs": keep_outs,
+    }
+
+
+def _before_mast(truth: Truth, height: float) -> tuple[Array, Array, list[dict[str, Any]]]:
+    """The arm's reach, but not beyond the table on the side away from its base, and the mast."""
     preset, model = truth.preset, truth.nominal_arm
     reach = float(np.abs(model.a).sum() + np.abs(model.d).sum()) + preset.boards.pen_m
     low, high = np.array([-reach, -reach, min(height, 0.0) - 0.05]), np.full(3, reach)
@@ -173,13 +192,7 @@ def _workspace(truth: Truth, height: float) -> dict[str, Any]:
     mast_low[axis], mast_high[axis] = sorted((far, far - np.sign(far) * MAST_M[1]))
     (low if far < 0 else high)[axis] = far
     mast = {"name": "mast", "min_m": _rounded(mast_low, 2), "max_m": _rounded(mast_high, 2)}
-    return {
-        "clearance_m": 0.03,
-        "device_radius_m": 0.12,
-        "joint_margin_deg": 5.0,
-        "box": {"min_m": _rounded(low, 2), "max_m": _rounded(high, 2)},
-        "keep_outs": [mast],
-    }
+    return low, high, [mast]
 
 
 def _outwards(values: Array, side: int) -> list[float]:

@@ -97,7 +97,9 @@ class TablePreset:
 @dataclass(frozen=True)
 class BoardPreset:
     """Board sizes: inner corners and square of the checkerboard; markers, side and pitch. The
-    bracket: boards `clearance_m` beside and `tray_m` before the flange, the pen's length."""
+    bracket: boards `clearance_m` beside and `tray_m` before the flange, the pen's length. They
+    face backwards, up while the pen points down, or `forwards`, as the pen points: an arm whose
+    forearm comes from below shows them so to a camera high above it."""
 
     inner_corners: tuple[int, int]
     square_m: float
@@ -107,8 +109,18 @@ class BoardPreset:
     clearance_m: float
     tray_m: float
     pen_m: float
+    forwards: bool = False
     scale_off: tuple[float, float] = (0.001, 0.005)
     bend_m: float = 0.3e-3
+
+
+@dataclass(frozen=True)
+class FencePreset:
+    """Where the arm may be, corners in the world, when camera and projector hang from the
+    ceiling; without a fence they are on a mast at the table's far edge."""
+
+    low_m: tuple[float, float, float]
+    high_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -126,6 +138,7 @@ class Preset:
     pen_slip_sigma_m: float = 0.15e-3
     tape_off_m: float = 0.10
     tape_off_deg: float = 10.0
+    fence: FencePreset | None = None
     body_radius_m: float = 0.05
     """Camera and projector are bodies of this radius around their optical centres."""
 
@@ -158,4 +171,35 @@ CR = Preset(
     ),
 )
 
-PRESETS = {preset.name: preset for preset in (CR,)}
+IR = Preset(
+    name="ir",
+    arm="irb4600-60/2.05",
+    arm_errors=ArmErrors(zero_sigma_deg=0.02, length_sigma_m=0.25e-3, twist_sigma_deg=0.01),
+    camera=CameraPreset(
+        size_px=(3840, 2160),
+        focal_px=(1830.0, 1828.0),
+        centre_px=(1916.0, 1096.0),
+        height_m=4.0,
+        tilt_deg=(6.0, 4.0),
+        yaw_deg=90.0,
+        factory_centre_off_px=4.0,
+        pixel_sigma=6.0,
+    ),
+    home_deg=(90.0, 0.0, 20.0, 0.0, 70.0, 0.0),
+    projector=ProjectorPreset(throw_ratio=1.40, distance_m=3.3, yaw_deg=90.0),
+    table=TablePreset(centre_m=(1.3, 0.0, 0.6), area_m=(0.750, 1.100), top_m=(1.50, 2.60)),
+    boards=BoardPreset(
+        inner_corners=(9, 6),
+        square_m=0.060,
+        markers=(3, 5),
+        marker_m=0.080,
+        pitch_m=0.100,
+        clearance_m=0.10,
+        tray_m=0.20,
+        pen_m=0.30,
+        forwards=True,
+    ),
+    fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.7)),
+)
+
+PRESETS = {preset.name: preset for preset in (CR, IR)}

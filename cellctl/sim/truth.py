@@ -261,18 +261,21 @@ def bracket(preset: BoardPreset) -> dict[str, tuple[Array, Array, Array]]:
     """Where the bracket holds its boards: name -> (T_flange_board, centre (2,), half size (2,)).
 
     A tray across the flange: the checkerboard on its +x wing, the markers on its -x wing, both
-    facing backwards (board z = flange z), so that they look up while the pen points down. Board
-    coordinates start at the first inner corner and at the first marker's first corner.
+    facing backwards (board z = flange z), so that they look up while the pen points down; or both
+    forwards, turned about the flange's x axis. Board coordinates start at the first inner corner
+    and at the first marker's first corner.
     """
+    facing = np.diag([1.0, -1.0, -1.0]) if preset.forwards else np.eye(3)
     columns, rows = preset.inner_corners
     square = preset.square_m
     checker_size = np.array([columns - 1, rows - 1]) * square
     checker_half = checker_size / 2 + square
     checker = np.eye(4)
-    checker[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    checker[:3, :3] = facing @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     marker_size = (np.array(preset.markers) - 1) * preset.pitch_m + preset.marker_m
     marker_half = marker_size / 2 + (preset.pitch_m - preset.marker_m)
     markers = np.eye(4)
+    markers[:3, :3] = facing
     _centre_at(
         checker, checker_size / 2, (preset.clearance_m + checker_half[1], 0.0, preset.tray_m)
     )
