@@ -20,7 +20,7 @@ from cellctl.calib.refine_fit import (
     fit,
 )
 from cellctl.calib.refine_result import Candidate, RefineResult
-from cellctl.calib.views import Rejection, excess, rms
+from cellctl.calib.views import Rejection, excess
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
 
@@ -67,7 +67,9 @@ def solve_refine(
         errors_mm=errors,
         used=used,
         rejected=tuple(
-            Rejection(drawn.keys[i], f"{np.linalg.norm(errors[i]):.1f} mm from where the others say")
+            Rejection(
+                drawn.keys[i], f"{np.linalg.norm(errors[i]):.1f} mm from where the others say"
+            )
             for i in np.flatnonzero(~used)
         ),
         mark_sigma_mm=_sigma(chosen.fit, errors[used]),
@@ -148,8 +150,8 @@ def _consensus(marks: Marks, frame: Frame) -> Mask:
     used = off < max(OUTLIER_SIGMAS * sigma, OUTLIER_FLOOR_MM)
     if used.sum() < max(MINIMUM_MARKS, (1 - LARGEST_REJECTED) * count):
         raise SolveError(
-            f"only {used.sum()} of {count} circles agree with each other: did the pen, the sheet or "
-            "the camera move between them?"
+            f"only {used.sum()} of {count} circles agree with each other: did the pen, the sheet "
+            "or the camera move between them?"
         )
     return used
 

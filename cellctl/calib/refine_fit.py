@@ -26,19 +26,19 @@ from cellctl.geometry import Array
 TCP_PRIOR_MM, MARK_SIGMA_MM = 20.0, 0.2
 """Per axis. The prior is loose: a tight one drags a pen that is off by millimetres."""
 LARGEST_CONDITION = 30.0
-STEPS = 12
+STEPS, NEGLIGIBLE_STEP = 12, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Mark:
     """A circle that was drawn: commanded world `xy` (2,) in metres at the tool's `yaw` in rad,
-    its centre `seen` (2,) in undistorted normalised camera coordinates, and its round."""
+    its centre `seen` (2,) in undistorted normalised camera coordinates, and its round, from 1."""
 
     key: str
     xy: Array
     yaw: float
     seen: Array
-    round: int = 0
+    round: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,14 +154,21 @@ class Frame:
 class Fit:
     """A refinement with the pen's offset `tcp` (2,), metres, that goes with it.
 
-    `normal` is A^T A + penalty in square millimetres with A (2n, p + 2), tcp in mm coming last;
-    `freedom` the degrees of freedom that the errors keep.
+    `normal` is A^T A + diag(penalty) in square millimetres with A (2n, p + 2), tcp in mm coming
+    last; `count` is n.
     """
 
     refinement: Refinement
     tcp: Array
     normal: Array
-    freedom: float
+    penalty: Array
+    count: int
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the errors keep: 2n less the trace of the hat matrix."""
+        spared = self.penalty @ np.linalg.inv(self.normal).diagonal()
+        return float(2 * self.count - len(self.penalty) + spared)
 
     def predict(self, marks: Marks) -> Array:
         """Camera coordinates (n, 2) where circles are to be seen."""
@@ -173,7 +180,11 @@ class Fit:
 
 
 def fit(
-    family: Family, marks: Marks, frame: Frame, start: Fit | None = None, weights: Array | None = None
+    family: Family,
+    marks: Marks,
+    frame: Frame,
+    start: Fit | None = None,
+    weights: Array | None = None,
 ) -> Fit:
     """Gauss-Newton on the errors in millimetres, weighted by `weights` (n,); tcp has its prior.
 
@@ -195,10 +206,9 @@ def fit(
         normal = A.T @ A + np.diag(penalty)
         step = np.linalg.solve(normal, -(A.T @ r + pull))
         values, tcp = values + step[:-2], tcp + 1e-3 * step[-2:]
-        if np.abs(step).max(initial=0.0) < 1e-9:
+        if np.abs(step).max() < NEGLIGIBLE_STEP:
             break
-    hat = float(np.trace(np.linalg.solve(normal, A.T @ A)))
-    return Fit(parameters.refinement(values), tcp, normal, 2 * len(marks) - hat)
+    return Fit(parameters.refinement(values), tcp, normal, penalty, len(marks))
 
 
 def condition(family: Family, marks: Marks, frame: Frame) -> float:

@@ -61,7 +61,9 @@ class Refinement:
 
     def _check(self) -> None:
         if self.family not in FAMILIES:
-            raise BadInput(f"refinement: no family is called {self.family!r}: {', '.join(FAMILIES)}")
+            raise BadInput(
+                f"refinement: no family is called {self.family!r}: {', '.join(FAMILIES)}"
+            )
         if self.kernel not in KERNELS:
             raise BadInput(f"refinement: no kernel is called {self.kernel!r}: {', '.join(KERNELS)}")
         if self.scale <= 0 or self.length <= 0 or abs(np.linalg.det(self.H)) < 1e-12:

@@ -24,6 +24,7 @@ RIDGES = np.logspace(-4, 3, 15)
 LENGTHS, SIGNAL, NOISE = (0.3, 3.0), (1e-3, 1e2), (1e-3, 3.0)
 """Bounds of the Gaussian process: lengths in half the drawn area's longer side, variances in
 those of what the trend leaves."""
+FREE = 1e3
 NEGLIGIBLE = 1e-7
 """Eigenvalues below this part of the largest are dropped: they only carry rounding errors."""
 
@@ -66,10 +67,10 @@ def _orthogonal(kernel: str, length: float, u: Array) -> tuple[Array, Array]:
 
 
 def _cross_validated(phi: Array, u: Array, left: Array) -> float:
-    """The ridge, the trend being refitted beside it: both are made orthogonal to it."""
-    trend = np.linalg.qr(np.column_stack([np.ones(len(u)), u]))[0]
-    phi, left = (array - trend @ (trend.T @ array) for array in (phi, left))
-    found = RidgeCV(RIDGES, fit_intercept=False).fit(phi, left / max(left.std(), 1e-12))
+    """The ridge. The trend is fitted along, its columns too long for the ridge to shorten."""
+    trend = np.column_stack([np.ones(len(u)), u])
+    columns = np.column_stack([FREE * trend, phi])
+    found = RidgeCV(RIDGES, fit_intercept=False).fit(columns, left / max(left.std(), 1e-12))
     return float(found.alpha_)
 
 
@@ -89,6 +90,13 @@ def _most_likely(u: Array, left: Array, length: float | None) -> tuple[float, fl
         )
         return -value, -slope
 
-    best = minimize(cost, kernel.theta, jac=True, method="L-BFGS-B", bounds=kernel.bounds).x
+    best = minimize(
+        cost,
+        kernel.theta,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=kernel.bounds,
+        options={"ftol": 1e-4},
+    ).x
     signal, found, noise = np.exp(best)
     return float(found), float(noise / signal)

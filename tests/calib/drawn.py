@@ -71,10 +71,12 @@ class DrawnCell:
         self, xy: Array, yaws: Array, pen: Array, rng: np.random.Generator, noise: float = 1.0
     ) -> list[Mark]:
         """Circles whose centres lie at the world points `pen` (n, 3)."""
-        pixels = self.truth.camera.project(pen) + rng.normal(0.0, noise * DETECTION_PX, (len(xy), 2))
+        pixels = self.truth.camera.project(pen) + rng.normal(
+            0.0, noise * DETECTION_PX, (len(xy), 2)
+        )
         centres = self.base.camera.normalise(pixels)
         return [
-            Mark(f"circle-{i:03d}", xy[i], float(yaws[i]), centres[i], i // 12)
+            Mark(f"circle-{i:03d}", xy[i], float(yaws[i]), centres[i], 1 + i // 12)
             for i in range(len(xy))
         ]
 
@@ -136,9 +138,7 @@ def _cell(
     return DrawnCell(truth, base, grid)
 
 
-def _seen(
-    truth: Truth, centres: dict[int, Array], rng: np.random.Generator
-) -> dict[int, Array]:
+def _seen(truth: Truth, centres: dict[int, Array], rng: np.random.Generator) -> dict[int, Array]:
     ids = sorted(centres)
     pixels = truth.camera.project(truth.light_lands(np.array([centres[i] for i in ids])))
     pixels = pixels + rng.normal(0.0, MARKER_PX, pixels.shape)
