@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.projector_map import ProjectorMap
+from cellctl.calib.refinement import Refinement
 from cellctl.errors import BadInput
 from cellctl.geometry import Array, Transform, as_transform
 
@@ -58,6 +59,8 @@ class Calibration:
     `boards` holds T_flange_<board> by the board's name. `table` lies in the world frame.
     `raw_pixels` marks the baselines whose homography works on raw camera pixels (divided by K):
     there a world point is pictured with distortion, which the homography then has to absorb.
+    `refinement`, where there is one, stands between camera and projector: where the pose has a
+    point in the undistorted picture -> where drawn circles show it.
     """
 
     camera: CameraModel
@@ -66,6 +69,20 @@ class Calibration:
     projector: ProjectorMap
     boards: Mapping[str, Transform] = field(default_factory=dict)
     raw_pixels: bool = False
+    refinement: Refinement | None = None
+
+    def __post_init__(self) -> None:
+        if self.raw_pixels and self.refinement is not None:
+            raise BadInput("calibration: a refinement needs undistorted pixels, not raw ones")
+
+    @property
+    def table_homography(self) -> Array:
+        """(3, 3): world (x, y) on the table, metres -> undistorted normalised camera
+        coordinates, without the refinement."""
+        slope = -self.table.normal[:2] / self.table.normal[2]
+        height = self.table.point[2] - slope @ self.table.point[:2]
+        lift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [*slope, height], [0.0, 0.0, 1.0]])
+        return (self.T_world_camera.inverse().matrix @ lift)[:3]
 
     def project(self, points: ArrayLike) -> Array:
         """Projector pixels (n, 2) that light the world points (n, 3), which lie on the table."""
@@ -74,6 +91,8 @@ class Calibration:
             xy = self.camera.plane(self.camera.project(in_camera))
         else:
             xy = in_camera[..., :2] / in_camera[..., 2:]
+        if self.refinement is not None:
+            xy = self.refinement.apply(xy)
         return self.projector.project(xy)
 
     def locate(self, pixels: ArrayLike) -> Array:
@@ -81,6 +100,8 @@ class Calibration:
         xy = self.projector.locate(np.asarray(pixels, dtype=float))
         if self.raw_pixels:
             xy = self.camera.normalise(self.camera.pixels(xy))
+        if self.refinement is not None:
+            xy = self.refinement.undo(xy)
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
         directions = rays @ self.T_world_camera.rotation.T
         return self.table.intersect(self.T_world_camera.translation, directions)
@@ -96,11 +117,13 @@ class Calibration:
             "projector": self.projector.to_dict(),
             "boards": {name: pose.to_list() for name, pose in sorted(self.boards.items())},
             "raw_pixels": self.raw_pixels,
+            "refinement": None if self.refinement is None else self.refinement.to_dict(),
         }
 
     @classmethod
     def from_dict(cls, value: Any, where: str = "calibration") -> Calibration:
-        """Read `to_dict`'s form. BadInput says `where`, the key, and what is wrong with it."""
+        """Read `to_dict`'s form; the key `refinement` may be missing. BadInput says `where`, the
+        key, and what is wrong with it."""
         if not isinstance(value, dict) or value.get("format") != FORMAT:
             found = value.get("format") if isinstance(value, dict) else type(value).__name__
             raise BadInput(f"{where}: the format must be {FORMAT!r}, not {found!r}")
@@ -115,6 +138,7 @@ class Calibration:
                 for name, pose in value["boards"].items()
             },
             raw_pixels=value["raw_pixels"],
+            refinement=_refinement(value.get("refinement"), f"{where}: refinement"),
         )
 
 
@@ -133,8 +157,13 @@ def _check_keys(value: dict[str, Any], where: str) -> None:
             raise BadInput(f"{where}: missing key {key!r}")
         if not isinstance(value[key], kind):
             raise BadInput(f"{where}: {key} must be a {kind.__name__}")
-    if unknown := sorted(set(value) - set(kinds)):
+    if unknown := sorted(set(value) - set(kinds) - {"refinement"}):
         raise BadInput(f"{where}: unknown key {unknown[0]!r}")
+
+
+def _refinement(value: Any, where: str) -> Refinement | None:
+    """Calibrations from before there were refinements lack the key."""
+    return None if value is None else Refinement.from_dict(value, where)
 
 
 def _plane(value: dict[str, Any], where: str) -> Plane:

@@ -1,0 +1,166 @@
+"""Which correction the drawn circles ask for: fitted, held out in two ways, chosen, explained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cellctl.calib.calibration import Calibration
+from cellctl.calib.refine_fit import (
+    FAMILIES,
+    LARGEST_CONDITION,
+    Family,
+    Fit,
+    Frame,
+    Mark,
+    Marks,
+    condition,
+    fit,
+)
+from cellctl.calib.refine_result import Candidate, RefineResult
+from cellctl.calib.views import Rejection, excess
+from cellctl.errors import SolveError
+from cellctl.geometry import Array, Mask
+
+MINIMUM_MARKS = 4
+BANDS = 5
+"""In which the marks' x, and their y, are cut: rows of a grid of up to five stay whole."""
+HUBER_MM = 0.4
+OUTLIER_SIGMAS, OUTLIER_FLOOR_MM = 5.0, 0.6
+LARGEST_REJECTED = 0.4
+
+
+def solve_refine(
+    marks: Sequence[Mark], base: Calibration, *, families: Sequence[str] | None = None
+) -> RefineResult:
+    """The correction of `base` (whose own refinement is ignored) that predicts unseen circles
+    best, and the pen's offset.
+
+    Each family is judged by the worse of two held-out errors, everything being fitted again:
+    without one circle, and without one row or column of them. The first that cannot be told from
+    the best is taken. Circles that contradict the others are left out of every fit and still get
+    a held-out error. `families`: only these are tried. SolveError when fewer than 4 circles agree;
+    BadInput as `Marks.of`.
+    """
+    base = replace(base, refinement=None)
+    marks = sorted(marks, key=lambda mark: mark.key)
+    drawn = Marks.of(marks, base)
+    if len(drawn) < MINIMUM_MARKS:
+        raise SolveError(f"only {len(drawn)} circles were measured, {MINIMUM_MARKS} are needed")
+    frame = Frame.of(drawn)
+    used = _consensus(drawn, frame)
+    wanted = [f for f in FAMILIES if families is None or f.name in families]
+    tried = [_candidate(family, drawn, used, frame, base) for family in wanted]
+    chosen, why = choose([c for c in tried if c.fit is not None])
+    assert chosen.fit is not None
+    errors = chosen.fit.errors_mm(drawn)
+    return RefineResult(
+        refinement=chosen.fit.refinement,
+        tcp_mm=1e3 * chosen.fit.tcp,
+        tcp_covariance_mm2=_tcp_covariance(chosen.fit, errors[used]),
+        chosen=chosen.name,
+        why=why,
+        candidates=tuple(tried),
+        keys=drawn.keys,
+        errors_mm=errors,
+        used=used,
+        rejected=tuple(
+            Rejection(
+                drawn.keys[i], f"{np.linalg.norm(errors[i]):.1f} mm from where the others say"
+            )
+            for i in np.flatnonzero(~used)
+        ),
+        mark_sigma_mm=_sigma(chosen.fit, errors[used]),
+        mark_freedom=chosen.fit.freedom,
+    )
+
+
+def choose(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
+    """The candidate to trust and why. They come from the simplest on; the first that the data
+    cannot tell from the best one wins, see `views.excess`."""
+    best = min(candidates, key=lambda c: c.worse_mm)
+    chosen = next(c for c in candidates if excess(c.held_out_mm, best.held_out_mm) <= 0.0)
+    if chosen is best:
+        return best, f"lowest held-out error, {best.worse_mm:.3f} mm"
+    return chosen, (
+        f"held-out error {chosen.worse_mm:.3f} mm; {best.name} reaches {best.worse_mm:.3f} mm, "
+        "which is less than one standard error better"
+    )
+
+
+def _candidate(
+    family: Family, marks: Marks, used: Mask, frame: Frame, base: Calibration
+) -> Candidate:
+    good = marks[used]
+    number = condition(family, good, frame)
+    if len(good) < family.least:
+        return Candidate(family.name, number, f"needs {family.least} circles, not {len(good)}")
+    if number > LARGEST_CONDITION:
+        why = f"the circles' places cannot determine it: condition number {number:.3g}"
+        return Candidate(family.name, number, why)
+    found = fit(family, good, frame)
+    predicted = {
+        name: _held_out(family, marks, used, frame, found, folds)
+        for name, folds in (("one", np.arange(len(good))[None]), ("row", rows(good.xy)))
+    }
+    return Candidate.measured(family.name, number, found, predicted, marks, used, base)
+
+
+def rows(xy: Array) -> Array:
+    """Bands (2, n) that marks at xy (n, 2) belong to: of x, and of y. Of equal width, so that a
+    row of a regular layout is left out whole."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    cell = (xy - low) / np.maximum(high - low, 1e-9) * BANDS
+    return np.minimum(cell, BANDS - 1).astype(int).T
+
+
+def _held_out(
+    family: Family, marks: Marks, used: Mask, frame: Frame, found: Fit, folds: Array
+) -> Array:
+    """Predicted camera coordinates (n, 2, s) of all marks, each by fits without it; folds (s, n')
+    number the folds of used marks in s ways. Marks not used are predicted by the whole fit."""
+    predicted = np.repeat(found.predict(marks)[..., None], len(folds), axis=2)
+    indices = np.flatnonzero(used)
+    for way, fold in enumerate(folds):
+        for number in np.unique(fold):
+            out = indices[fold == number]
+            rest = fit(family, marks[indices[fold != number]], frame, start=found)
+            predicted[out, :, way] = rest.predict(marks[out])
+    return predicted
+
+
+def _consensus(marks: Marks, frame: Frame) -> Mask:
+    """Which marks (n,) agree with what most of them say: robustly fitted, Huber's weights."""
+    count = len(marks)
+    family = max(
+        (f for f in FAMILIES[:5] if f.least <= count and condition(f, marks, frame) < 1e3),
+        key=lambda f: f.least,
+    )
+    weights, found = np.ones(count), None
+    for _ in range(20):
+        found = fit(family, marks, frame, start=found, weights=weights)
+        off = np.linalg.norm(found.errors_mm(marks), axis=1)
+        new = HUBER_MM / np.maximum(off, HUBER_MM)
+        if np.abs(new - weights).max() < 1e-3:
+            break
+        weights = new
+    sigma = float(np.median(off)) / 1.1774
+    used = off < max(OUTLIER_SIGMAS * sigma, OUTLIER_FLOOR_MM)
+    if used.sum() < max(MINIMUM_MARKS, (1 - LARGEST_REJECTED) * count):
+        raise SolveError(
+            f"only {used.sum()} of {count} circles agree with each other: did the pen, the sheet "
+            "or the camera move between them?"
+        )
+    return used
+
+
+def _sigma(found: Fit, errors: Array) -> float:
+    """Standard deviation of a mark per axis, mm, from the fit's errors (n, 2)."""
+    return float(np.sqrt(np.square(errors).sum() / max(found.freedom, 1.0)))
+
+
+def _tcp_covariance(found: Fit, errors: Array) -> Array:
+    """(2, 2) in square mm; the prior's where yaws tell nothing."""
+    return np.linalg.inv(found.normal)[-2:, -2:] * max(_sigma(found, errors), 1e-3) ** 2
