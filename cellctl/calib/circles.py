@@ -29,9 +29,11 @@ HALF = 0.4
 """With less ink than that, what is there need not be the circle."""
 RADII = (0.5, 1.5)
 """Circles of that many times the commanded radius are told."""
-RADIUS_STEP_PX = 1.2
+RADIUS_STEP_PX, RADIUS_STEP = 1.2, 0.06
 EACH = 10
 """So many rings at most are looked at for each expected one."""
+WEAKER = 0.35
+"""... and none that has less than that share of the best one's votes."""
 ROUND_PX = 0.7
 """A line that leaves the fitted circle by more, rms, is no circle."""
 SAME_PX = 2.0
@@ -169,19 +171,22 @@ def _candidates(picture: Picture, view: PlaneView, wanted: _Wanted) -> Candidate
     found = vote(thin_lines(flat, wanted.line_m), flat, _radii(wanted, flat.cell_m), near > 0)
     gaps = np.linalg.norm(found.centres[None] - wanted.centres[:, None], axis=-1)
     votes = np.where(gaps <= wanted.search_m + 2.0 * flat.cell_m, found.votes, 0.0)
+    votes[votes < WEAKER * votes.max(axis=1, keepdims=True, initial=0.0)] = 0.0
     best = np.argsort(-votes, axis=1)[:, :EACH]
     kept = best[np.take_along_axis(votes, best, axis=1) > 0]
     return found[np.unique(kept)]
 
 
 def _radii(wanted: _Wanted, cell_m: float) -> Array:
-    """Radii (k,) to try: about every commanded one, neighbours hardly more than a pixel apart."""
-    step = RADIUS_STEP_PX * cell_m
-    tried = set()
-    for radius in np.unique(wanted.radii):
-        low = max(RADII[0] * radius, LEAST_RADIUS_PX * cell_m)
-        tried |= set(range(round(low / step), round(RADII[1] * radius / step) + 1))
-    return np.array(sorted(tried)) * step
+    """Radii (k,) to try, about every commanded one: as near to each other as a fit reaches."""
+    low = max(RADII[0] * float(wanted.radii.min()), LEAST_RADIUS_PX * cell_m)
+    high = RADII[1] * float(wanted.radii.max())
+    tried = [low]
+    while tried[-1] < high:
+        tried.append(tried[-1] + max(RADIUS_STEP_PX * cell_m, RADIUS_STEP * tried[-1]))
+    radii = np.array(tried)
+    relative = radii / wanted.radii[:, None]
+    return radii[((relative >= 0.9 * RADII[0]) & (relative <= 1.1 * RADII[1])).any(axis=0)]
 
 
 def _distinct(rings: Rings, view: PlaneView, sound: Mask) -> Array:

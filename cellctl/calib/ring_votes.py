@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cellctl.calib.plane_view import Flat
 from cellctl.geometry import Array, Mask
@@ -20,8 +21,12 @@ CLEAR = 5.0
 LEAST_DEPTH = 1.5
 """Grey levels; what is fainter is no line in any light."""
 BLUR_OF_VOTES = 1.2
-LEAST_SHARE = 0.12
+APART = 2.5
+"""Cells: rings whose centres and radii differ by less are one."""
+LEAST_SHARE = 0.22
 """Of a ring's circumference that must vote for a centre."""
+SCATTER = 0.75
+"""How widely a whole ring's votes scatter, in cells: a measured value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +94,22 @@ def _normals(soft: Array, rows: Array, columns: Array) -> Array:
 def vote(lines: Lines, flat: Flat, radii: Array, wanted: Mask) -> Candidates:
     """Peaks of the votes for rings of `radii` (k,) metres with centres where `wanted` (h, w)."""
     found = [_peaks(lines, flat, float(radius), wanted) for radius in radii]
-    return Candidates(
+    every = Candidates(
         np.concatenate([c.centres for c in found]),
         np.concatenate([c.radii for c in found]),
         np.concatenate([c.votes for c in found]),
     )
+    return every[_strongest(every, APART * flat.cell_m)]
+
+
+def _strongest(candidates: Candidates, near_m: float) -> Array:
+    """Numbers of the candidates that have no stronger one of about the same centre and radius."""
+    pairs = cKDTree(np.column_stack([candidates.centres, candidates.radii])).query_pairs(
+        near_m, output_type="ndarray"
+    )
+    votes = candidates.votes[pairs]
+    weaker = np.where(votes[:, 0] < votes[:, 1], pairs[:, 0], pairs[:, 1])
+    return np.setdiff1d(np.arange(len(candidates.votes)), weaker)
 
 
 def _peaks(lines: Lines, flat: Flat, radius: float, wanted: Mask) -> Candidates:
@@ -103,8 +119,7 @@ def _peaks(lines: Lines, flat: Flat, radius: float, wanted: Mask) -> Candidates:
     inside = ((targets >= 0) & (targets < (w, h))).all(axis=1)
     flat_index = targets[inside, 1] * w + targets[inside, 0]
     counts = np.bincount(flat_index, minlength=h * w).reshape(h, w).astype(np.float32)
-    # A ring's votes scatter about as widely as the blur: then this is near 1 for a whole one.
-    whole = 2.0 * np.pi * radius / flat.cell_m / (4.0 * np.pi * BLUR_OF_VOTES**2)
+    whole = radius / flat.cell_m / (BLUR_OF_VOTES**2 + SCATTER**2)  # 2 pi r / (2 pi sigma^2)
     share = cv2.GaussianBlur(counts, (0, 0), BLUR_OF_VOTES) / whole
     top = (share >= cv2.dilate(share, np.ones((5, 5), np.uint8))) & (share > LEAST_SHARE) & wanted
     rows, columns = np.nonzero(top)

@@ -116,15 +116,15 @@ def _edge(signed: Array, cell: float) -> Array:
 
 @dataclass
 class Sheet:
-    """Paper under a camera; things are drawn one upon the other."""
+    """Paper under a camera; things are drawn one upon the other. `blur` is the lens's, pixels,
+    and comes before the sensor's sampling."""
 
     camera: CameraModel
     T: Array
     light: Light = field(default_factory=Light)
+    blur: float = 0.7
 
-    def picture(
-        self, things: Any, *, noise: float = 1.0, blur: float = 0.7, seed: int = 0
-    ) -> Any:
+    def picture(self, things: Any, *, noise: float = 1.0, seed: int = 0) -> Any:
         """(h, w) uint8; `noise` is that of the mean of several pictures."""
         w, h = self.camera.image_size
         reflected = np.ones((h, w), np.float32)
@@ -132,8 +132,6 @@ class Sheet:
         for thing in things:
             self._draw(thing, reflected, added)
         lit = self._lit(reflected, added)
-        if blur:
-            lit = cv2.GaussianBlur(lit, (0, 0), blur)
         rng = np.random.default_rng(seed)
         lit += np.float32(noise) * rng.standard_normal(lit.shape, dtype=np.float32)
         return np.clip(np.rint(lit), 0, 255).astype(np.uint8)
@@ -147,14 +145,14 @@ class Sheet:
         (x0, y0), (x1, y1) = thing.box()
         corners = self.project(np.array([(x0, y0), (x1, y0), (x0, y1), (x1, y1)]))
         w, h = self.camera.image_size
-        left, top = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, (w - 1, h - 1))
-        right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, 1, (w, h))
+        left, top = np.clip(np.floor(corners.min(axis=0)).astype(int) - 5, 0, (w - 1, h - 1))
+        right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 6, 1, (w, h))
         if right <= left or bottom <= top:
             return
         places = self._fine_places(left, top, right, bottom)
         cell = float(np.linalg.norm(places[0, 1] - places[0, 0]))
-        share = thing.cover(places, cell)
         n = SUPERSAMPLE
+        share = cv2.GaussianBlur(thing.cover(places, cell), (0, 0), self.blur * n)
         share = share.reshape(bottom - top, n, right - left, n).mean(axis=(1, 3))
         part = np.s_[top:bottom, left:right]
         if thing.ink >= 0:
