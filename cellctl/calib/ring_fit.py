@@ -123,10 +123,9 @@ def _profiles(
     count = int(np.ceil(REACH * middle / STEP_PX))
     t = np.arange(-count, count + 1) * STEP_PX
     on_line = centres[:, None] + radii[:, None, None] * spokes
-    outward = pixel_m[:, None, None, None] * t[[0, -1], None] * spokes[:, None]
+    outward = pixel_m[:, None, None, None] * t[[0, count, -1], None] * spokes[:, None]
     ends = view.pixels(on_line[:, :, None] + outward)
-    share = ((t - t[0]) / (t[-1] - t[0]))[:, None]
-    pixels = ends[:, :, :1] * (1.0 - share) + ends[:, :, 1:] * share
+    pixels = _parabolas(t / t[-1]) @ ends
     unseen = ~view.inside(ends, 1.0).all(axis=-1)
     pixels = np.nan_to_num(pixels)
     values = np.asarray(sample(picture.values, pixels), dtype=float)
@@ -136,6 +135,12 @@ def _profiles(
     if picture.blind is not None:
         unseen |= sample(picture.blind, pixels[:, :, count]) > 0.25
     return _Profiles(off, depth, values[..., count], level, unseen)
+
+
+def _parabolas(u: Array) -> Array:
+    """(k, 3): weights of what stands at -1, 0 and 1 for u (k,) on the parabola through it.
+    A straight line would do for all but perspective, which bends it by 0.005 px."""
+    return np.stack([0.5 * u * (u - 1.0), 1.0 - u * u, 0.5 * u * (u + 1.0)], axis=-1)
 
 
 def _bell_solver(t: Array, sigma: float) -> Array:
