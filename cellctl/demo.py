@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from cellctl import published
 from cellctl.bus.client import Client
 from cellctl.bus.follow import Link, Update
 from cellctl.bus.session import free_endpoint
@@ -27,6 +28,7 @@ from cellctl.calib.calibration import Calibration
 from cellctl.config import load_config
 from cellctl.errors import BadInput, CellctlError, Unreachable
 from cellctl.messages import RunInfo
+from cellctl.procedures.comparison import STAGE_OF
 from cellctl.sim.cell_config import cell_document, to_toml
 from cellctl.sim.endpoint import read_endpoint
 from cellctl.sim.launch import endpoint_file, stop_world
@@ -37,6 +39,7 @@ READY_S = 60.0
 END_S = 30.0
 ENDING_S = 5.0
 """How long a process that has left the bus may take to end."""
+HELD_OUT = ("held_out_px", "held_out_mm", "held_out_ci_mm")
 SILENCE_S = 60.0
 WORLD_IDLE_S = 60.0
 """After this long without a daemon the world of a demo that was killed ends by itself."""
@@ -82,6 +85,7 @@ def run_demo(
         "cell": cell,
         "seed": seed,
         **result,
+        "paper": published.PAPER.get(PRESETS[cell].arm),
         "samples": info.samples,
         "run": info.run_id,
         "record": info.directory,
@@ -198,27 +202,46 @@ def _calibration(client: Client, info: RunInfo) -> Calibration | None:
 
 
 async def score(info: RunInfo, calibration: Calibration | None, folder: Path) -> dict[str, Any]:
-    """The stage table and the final figures, scored against the truth of the world in `folder`."""
+    """The tables and the final figures, scored against the truth of the world in `folder`."""
+    data = (info.result or {}).get("data") or {}
     scorer = Scorer(read_endpoint(endpoint_file(folder)))
     try:
         grid = await scorer.grid()
-        rows = [
+        stages = [
             {
                 "name": stage["name"],
                 "training_px": stage["training_px"],
                 "held_out_px": stage["held_out_px"],
                 **await scorer.score(_staged(stage).project(grid)),
             }
-            for stage in ((info.result or {}).get("data") or {}).get("stages", [])
+            for stage in data.get("stages", [])
         ]
-        final: dict[str, Any] = {"true_px": None, "true_mm": None}
+        true: dict[str, Any] = {"true_px": None, "true_mm": None}
         if calibration is not None:
-            final = dict(await scorer.score(calibration.project(grid)))
+            true = dict(await scorer.score(calibration.project(grid)))
         collisions = await scorer.collisions()
     finally:
         await scorer.close()
-    final |= {"verdict": info.verdict or info.status, "reasons": info.reasons or _why(info)}
-    return {"stages": rows, "final": final, "collisions": len(collisions)}
+    judged = {key: data.get("evaluate", {}).get(key) for key in HELD_OUT}
+    verdict = {"verdict": info.verdict or info.status, "reasons": info.reasons or _why(info)}
+    return {
+        "table": _table(data.get("table", []), stages, true),
+        "stages": stages,
+        "final": judged | true | verdict,
+        "collisions": len(collisions),
+    }
+
+
+def _table(
+    rows: list[dict[str, Any]], stages: list[dict[str, Any]], final: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """The rows of the paper's Table II with what is true of them."""
+    by_name = {stage["name"]: stage for stage in stages}
+    table = []
+    for row in rows:
+        true = by_name.get(STAGE_OF.get(row["row"], ""), final)
+        table.append({**row, "true_px": true["true_px"], "true_mm": true["true_mm"]})
+    return table
 
 
 def _staged(stage: dict[str, Any]) -> Calibration:

@@ -2,54 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cellctl.calib.camera import CameraModel
+from cellctl.calib.plane import Plane
 from cellctl.calib.projector_map import ProjectorMap
 from cellctl.calib.refinement import Refinement
+from cellctl.calib.table import TableSurface
 from cellctl.errors import BadInput
 from cellctl.geometry import Array, Transform, as_transform
 
+__all__ = ["Calibration", "Plane"]
+
 FORMAT = "cellctl-calibration/1"
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """All p with normal . (p - point) = 0; both (3,), in the world frame, metres."""
-
-    point: Array
-    normal: Array
-
-    def __post_init__(self) -> None:
-        for name in ("point", "normal"):
-            try:
-                vector = np.array(getattr(self, name), dtype=float)
-            except (TypeError, ValueError):
-                vector = np.zeros(0)
-            if vector.shape != (3,) or not np.isfinite(vector).all():
-                raise BadInput(f"plane: {name} must be three finite numbers")
-            vector.flags.writeable = False
-            object.__setattr__(self, name, vector)
-        if not abs(np.linalg.norm(self.normal) - 1.0) < 1e-6:
-            raise BadInput("plane: the normal must have the length 1")
-
-    @classmethod
-    def horizontal(cls, height: float) -> Plane:
-        """z = `height` metres."""
-        return cls(np.array([0.0, 0.0, height]), np.array([0.0, 0.0, 1.0]))
-
-    def intersect(self, origin: Array, directions: Array) -> Array:
-        """Where the lines from origin (3,) along directions (..., 3) meet it."""
-        along = ((self.point - origin) @ self.normal) / (directions @ self.normal)
-        return origin + directions * along[..., None]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"point": self.point.tolist(), "normal": self.normal.tolist()}
+LATER = {"refinement", "surface", "quality"}
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +32,9 @@ class Calibration:
     `raw_pixels` marks the baselines whose homography works on raw camera pixels (divided by K):
     there a world point is pictured with distortion, which the homography then has to absorb.
     `refinement`, where there is one, stands between camera and projector: where the pose has a
-    point in the undistorted picture -> where drawn circles show it.
+    point in the undistorted picture -> where drawn circles show it. `surface` is the table as it
+    was measured, with bow and uncertainty; `table` is its plane. `quality` holds JSON: held-out
+    errors, covariances, what is known of the pen.
     """
 
     camera: CameraModel
@@ -70,6 +44,8 @@ class Calibration:
     boards: Mapping[str, Transform] = field(default_factory=dict)
     raw_pixels: bool = False
     refinement: Refinement | None = None
+    surface: TableSurface | None = None
+    quality: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.raw_pixels and self.refinement is not None:
@@ -84,9 +60,29 @@ class Calibration:
         lift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [*slope, height], [0.0, 0.0, 1.0]])
         return (self.T_world_camera.inverse().matrix @ lift)[:3]
 
+    @property
+    def T_camera_table(self) -> Array:
+        """(4, 4): from a frame on the table, whose x and y are the world's as seen from above."""
+        foot = np.array([0.0, 0.0, float(self.table.height(np.zeros(2)))])
+        normal = self.table.normal * np.sign(self.table.normal[2])
+        x = np.cross((0.0, 1.0, 0.0), normal)
+        x /= np.linalg.norm(x)
+        frame = np.eye(4)
+        frame[:3, :3] = np.column_stack([x, np.cross(normal, x), normal])
+        frame[:3, 3] = foot
+        return self.T_world_camera.inverse().matrix @ frame
+
+    def on(self, surface: TableSurface) -> Calibration:
+        """The same cell with this table, as it was measured. A refinement was made for another
+        table, and is left out."""
+        return replace(self, table=surface.plane, surface=surface, refinement=None)
+
     def project(self, points: ArrayLike) -> Array:
-        """Projector pixels (n, 2) that light the world points (n, 3), which lie on the table."""
-        in_camera = self.T_world_camera.inverse().apply(points)
+        """Projector pixels (n, 2) that light the points (x, y) of the world, (n, 2), on the table.
+        With (n, 3) the height is not looked at: light is only known where it lands."""
+        ground = np.asarray(points, dtype=float)[..., :2]
+        in_world = np.concatenate([ground, self.table.height(ground)[..., None]], axis=-1)
+        in_camera = self.T_world_camera.inverse().apply(in_world)
         if self.raw_pixels:
             xy = self.camera.plane(self.camera.project(in_camera))
         else:
@@ -117,13 +113,15 @@ class Calibration:
             "projector": self.projector.to_dict(),
             "boards": {name: pose.to_list() for name, pose in sorted(self.boards.items())},
             "raw_pixels": self.raw_pixels,
-            "refinement": None if self.refinement is None else self.refinement.to_dict(),
+            "refinement": self.refinement and self.refinement.to_dict(),
+            "surface": self.surface and self.surface.to_dict(),
+            "quality": dict(self.quality),
         }
 
     @classmethod
     def from_dict(cls, value: Any, where: str = "calibration") -> Calibration:
-        """Read `to_dict`'s form; the key `refinement` may be missing. BadInput says `where`, the
-        key, and what is wrong with it."""
+        """Read `to_dict`'s form; what was added later (LATER) may be missing. BadInput says
+        `where`, the key, and what is wrong with it."""
         if not isinstance(value, dict) or value.get("format") != FORMAT:
             found = value.get("format") if isinstance(value, dict) else type(value).__name__
             raise BadInput(f"{where}: the format must be {FORMAT!r}, not {found!r}")
@@ -131,14 +129,16 @@ class Calibration:
         return cls(
             camera=CameraModel.from_dict(value["camera"], f"{where}: camera"),
             T_world_camera=as_transform("world", "camera", value["T_world_camera"], where),
-            table=_plane(value["table"], where),
+            table=Plane.from_dict(value["table"], f"{where}: table"),
             projector=ProjectorMap.from_dict(value["projector"], f"{where}: projector"),
             boards={
                 name: as_transform("flange", name, pose, f"{where}: boards")
                 for name, pose in value["boards"].items()
             },
             raw_pixels=value["raw_pixels"],
-            refinement=_refinement(value.get("refinement"), f"{where}: refinement"),
+            refinement=_later(value, "refinement", Refinement.from_dict, where),
+            surface=_later(value, "surface", TableSurface.from_dict, where),
+            quality=_later(value, "quality", _mapping, where) or {},
         )
 
 
@@ -157,19 +157,17 @@ def _check_keys(value: dict[str, Any], where: str) -> None:
             raise BadInput(f"{where}: missing key {key!r}")
         if not isinstance(value[key], kind):
             raise BadInput(f"{where}: {key} must be a {kind.__name__}")
-    if unknown := sorted(set(value) - set(kinds) - {"refinement"}):
+    if unknown := sorted(set(value) - set(kinds) - LATER):
         raise BadInput(f"{where}: unknown key {unknown[0]!r}")
 
 
-def _refinement(value: Any, where: str) -> Refinement | None:
-    """Calibrations from before there were refinements lack the key."""
-    return None if value is None else Refinement.from_dict(value, where)
+def _later(value: dict[str, Any], key: str, read: Callable[[Any, str], T], where: str) -> T | None:
+    """Calibrations from before there was such a thing lack the key."""
+    found = value.get(key)
+    return None if found is None else read(found, f"{where}: {key}")
 
 
-def _plane(value: dict[str, Any], where: str) -> Plane:
-    try:
-        return Plane(value["point"], value["normal"])
-    except KeyError as error:
-        raise BadInput(f"{where}: table: missing key {error}") from None
-    except BadInput as error:
-        raise BadInput(f"{where}: table: {error.message}") from None
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise BadInput(f"{where}: must be an object, not {type(value).__name__}")
+    return value

@@ -152,9 +152,7 @@ def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
     coarse = coarse[_distinct(coarse, view, coarse.ink > HALF / 2)]
     circumference = 2.0 * np.pi * np.median(wanted.radii) / np.median(view.pixel_m(wanted.centres))
     angles = int(np.clip(circumference, 64, 160))
-    fine = fit_rings(
-        picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles
-    )
+    fine = fit_rings(picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles)
     sound = (fine.rms_px < ROUND_PX) & (fine.ink > HALF / 2)
     return fine[_distinct(fine, view, sound)]
 

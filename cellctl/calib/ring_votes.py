@@ -85,7 +85,8 @@ def _normals(soft: Array, rows: Array, columns: Array) -> Array:
     """(n, 2) directions across the line at each cell: the stronger axis of the structure tensor."""
     x, y = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
     xx, xy, yy = (
-        cv2.GaussianBlur(product, (0, 0), TENSOR)[rows, columns] for product in (x * x, x * y, y * y)
+        cv2.GaussianBlur(product, (0, 0), TENSOR)[rows, columns]
+        for product in (x * x, x * y, y * y)
     )
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -1,49 +1,72 @@
-"""Everything that there is, one after the other: intrinsic, hand-eye, projector.
+"""Everything that there is, one after the other: intrinsic, hand-eye, projector, measure-table,
+draw, refine, evaluate, and the verdict of all together.
 
 Each part is the procedure that also runs alone, in a scope of its own; what one part found out is
-what the next one starts from. The verdict is that of all parts together.
+what the next one starts from. A pen or a sheet that fails ends the drawing, and is named.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
-from cellctl.calib import stages
 from cellctl.calib.calibration import Calibration
+from cellctl.calib.refine_result import RefineResult
+from cellctl.calib.stages import Stage
+from cellctl.calib.table import TableResult
 from cellctl.cell import Cell
-from cellctl.procedures import hand_eye, intrinsic, projector
-from cellctl.procedures.belief import Belief
-from cellctl.procedures.hand_eye import HandEyeParams
-from cellctl.procedures.intrinsic import IntrinsicParams
-from cellctl.procedures.knowledge import (
-    Knowledge,
-    factory_camera,
-    known,
-    lens_prior,
-    table_plane,
+from cellctl.errors import SolveError
+from cellctl.procedures import (
+    comparison,
+    draw,
+    drawn,
+    evaluate,
+    hand_eye,
+    intrinsic,
+    measure_table,
+    optical,
+    projector,
+    refine,
 )
-from cellctl.procedures.projector import ProjectorParams
+from cellctl.procedures.belief import Belief
+from cellctl.procedures.draw import DrawParams
+from cellctl.procedures.evaluate import EvaluateParams, Judged, Noise
+from cellctl.procedures.knowledge import Knowledge, known
+from cellctl.procedures.measure_table import MeasureTableParams
+from cellctl.procedures.optical import HAND_EYE, INTRINSIC, PROJECTOR, OpticalParams
+from cellctl.procedures.pictures import PICTURES
 from cellctl.procedures.record import Record, recorded
+from cellctl.procedures.refine import RefineParams
 from cellctl.run import Procedure, Result, Run
 
-INTRINSIC, HAND_EYE, PROJECTOR = "intrinsic", "hand-eye", "projector"
+TABLE, DRAW, REFINE, EVALUATE = "measure-table", "draw", "refine", "evaluate"
+BASE, REFINED = "base", "refined"
 
 
-class FullParams(BaseModel):
+class FullParams(OpticalParams):
     """The parameters of the parts."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    intrinsic: IntrinsicParams = IntrinsicParams()
-    hand_eye: HandEyeParams = HandEyeParams()
-    projector: ProjectorParams = ProjectorParams()
+    measure_table: MeasureTableParams = MeasureTableParams()
+    draw: DrawParams = DrawParams()
+    refine: RefineParams = RefineParams()
+    evaluate: EvaluateParams = EvaluateParams()
 
 
 async def run_full(run: Run, cell: Cell, params: FullParams) -> Result:
     """Collect all, then solve and judge all together."""
+    await _look(run, cell, params)
+    await measure_table.collect(run.scope(TABLE), cell, params.measure_table)
+    base = await _kept(run, BASE, base_of, _record(run, cell, params))
+    if base is not None:
+        await draw.collect(run.scope(DRAW), cell, params.draw, base)
+        refined = await _kept(run, REFINED, refined_of, _record(run, cell, params), base)
+        if refined is not None:
+            await evaluate.collect(run.scope(EVALUATE), cell, params.evaluate, refined)
+    return await run.call(conclude, _record(run, cell, params))
+
+
+async def _look(run: Run, cell: Cell, params: FullParams) -> None:
+    """Boards and projected markers."""
     start = known(cell.config, run.calibration)
     await projector.look_before(run.scope(PROJECTOR), cell, params.projector, start)
     belief = start.belief(cell.config, intrinsic.BOARD)
@@ -52,11 +75,21 @@ async def run_full(run: Run, cell: Cell, params: FullParams) -> Result:
     belief = await hand_eye.collect(run.scope(HAND_EYE), cell, params.hand_eye, belief)
     found = Knowledge(belief.camera, belief.T_world_camera, calibrated=True, boards={})
     await projector.collect(run.scope(PROJECTOR), cell, params.projector, found)
-    return await run.call(conclude, _record(run, cell, params))
 
 
 def _record(run: Run, cell: Cell, params: FullParams) -> Record[FullParams]:
     return recorded(run, cell.config, params)
+
+
+async def _kept(run: Run, name: str, solve: Any, *args: Any) -> Calibration | None:
+    """What `solve` finds, once a run: a resumed run goes on with the same. None when that is no
+    calibration to go on with."""
+    found = run.recall(name)
+    if found is None:
+        calibration: Calibration | None = await run.call(solve, *args)
+        found = {"calibration": calibration.to_dict() if calibration else None}
+        await run.record(name, **found)
+    return Calibration.from_dict(found["calibration"], name) if found["calibration"] else None
 
 
 def _next_belief(record: Record[FullParams], start: Knowledge, belief: Belief) -> Belief:
@@ -69,49 +102,116 @@ def _next_belief(record: Record[FullParams], start: Knowledge, belief: Belief) -
     return found.belief(record.config, hand_eye.BOARD)
 
 
+def base_of(record: Record[FullParams]) -> Calibration | None:
+    """Pure: the calibration with which circles are drawn and found; None when the parts before
+    have failed already, and paper would be wasted."""
+    seen = optical.solve(record, record.params)
+    table = _table(record)
+    failed = any(seen.judged(record.params).values())
+    if failed or measure_table.judge(table, record.params.measure_table)[1]:
+        return None
+    return seen.calibration(table.surface.plane).on(table.surface)
+
+
+def refined_of(record: Record[FullParams], base: Calibration) -> Calibration | None:
+    """Pure: the calibration that is evaluated; None when what was drawn has failed already."""
+    ink = _ink(record, base)
+    return None if ink.reasons or ink.result is None else refine.refined(base, ink.result)
+
+
+def _table(record: Record[FullParams]) -> TableResult:
+    return measure_table.solve(record.scoped(TABLE, record.params.measure_table))
+
+
+@dataclass(frozen=True, eq=False)
+class Ink:
+    """What was drawn, and what came of it: `reasons` against the drawing, and the correction,
+    None when the circles do not give one."""
+
+    drawn: drawn.Drawn
+    faults: list[str]
+    refusals: list[str]
+    result: RefineResult | None
+
+    @property
+    def reasons(self) -> list[str]:
+        return [*self.faults, *self.refusals]
+
+
+def _ink(record: Record[FullParams], base: Calibration) -> Ink:
+    """Pure: circles, their faults, and the correction."""
+    found = draw.seen(record.scoped(DRAW, record.params.draw), base)
+    faults = drawn.faults(found, base)
+    marks = found.marks(base.camera)
+    refusals = refine.slipped(marks, base)
+    try:
+        result = refine.solve(marks, base)
+    except SolveError as error:
+        return Ink(found, faults, refusals or [error.message], None)
+    return Ink(found, faults, refusals + refine.judge(result, record.params.refine), result)
+
+
 def conclude(record: Record[FullParams]) -> Result:
-    """Pure: from what was recorded to all results, the stage table and the calibration."""
-    config, params = record.config, record.params
-    checker = intrinsic.seen(record.scoped(INTRINSIC, params.intrinsic))
-    markers = hand_eye.seen(record.scoped(HAND_EYE, params.hand_eye))
-    shown = projector.seen(record.scoped(PROJECTOR, params.projector))
-    camera = intrinsic.solve(checker)
-    pose = hand_eye.solve(markers, camera.camera)
-    light = projector.solve(shown, camera.camera, lens_prior(config))
-    verdicts = {
-        INTRINSIC: intrinsic.judge(camera, params.intrinsic),
-        HAND_EYE: hand_eye.judge(pose, params.hand_eye),
-        PROJECTOR: projector.judge(light, shown, params.projector),
-    }
-    calibration = Calibration(
-        camera=camera.camera,
-        T_world_camera=pose.camera_pose,
-        table=table_plane(config),
-        projector=light.map,
-        boards={hand_eye.BOARD: pose.board_pose},
-    )
-    cell = stages.CellData(
-        intrinsic=checker.views,
-        hand_eye=markers.views,
-        pictures=shown.pictures,
-        centres=shown.centres,
-        factory=factory_camera(config),
-        table=table_plane(config),
-        lens=lens_prior(config),
-    )
-    table = stages.solve_stages(cell, intrinsic=camera, hand_eye=pose)
-    reasons = [f"{part}: {reason}" for part, (_, why) in verdicts.items() for reason in why]
-    data = {
-        "kind": "full",
-        INTRINSIC: _part(verdicts[INTRINSIC], checker.merged(camera.to_dict())),
-        HAND_EYE: _part(verdicts[HAND_EYE], markers.merged(pose.to_dict())),
-        PROJECTOR: _part(verdicts[PROJECTOR], light.to_dict()),
-        "stages": [_row(stage) for stage in table],
-    }
-    return Result.judged(reasons, data, calibration.to_dict())
+    """Pure: from what was recorded to all results, the tables and the calibration."""
+    params = record.params
+    seen = optical.solve(record, params)
+    table = _table(record)
+    stages = seen.stages(record.config)
+    reasons = dict(seen.judged(params))
+    reasons[TABLE] = measure_table.judge(table, params.measure_table)[1]
+    data: dict[str, Any] = {**seen.data(), TABLE: table.to_dict()}
+    best = seen.calibration(table.surface.plane).on(table.surface)
+    if record.scoped(DRAW, params.draw).samples(draw.CIRCLES):
+        best = _prove(record, best, stages, data, reasons)
+    for part, why in reasons.items():
+        verdict = "fail" if why else "pass"
+        data[part] = {"verdict": verdict, "reasons": list(why), **data.get(part, {})}
+    every = [f"{part}: {reason}" for part, why in reasons.items() for reason in why]
+    data = {"kind": "full", **data, "stages": [_stage(stage) for stage in stages]}
+    return Result.judged(every, data, best.to_dict())
 
 
-def _row(stage: stages.Stage) -> dict[str, Any]:
+def _prove(
+    record: Record[FullParams],
+    base: Calibration,
+    stages: list[Stage],
+    data: dict[str, Any],
+    reasons: dict[str, tuple[str, ...]],
+) -> Calibration:
+    """What the circles say, into `data` and `reasons`; the calibration with their correction."""
+    ink = _ink(record, base)
+    data[DRAW], reasons[DRAW] = ink.drawn.to_dict(), tuple(ink.faults)
+    reasons[REFINE] = tuple(ink.refusals)
+    if ink.result is None:
+        return base
+    best = refine.refined(base, ink.result)
+    data[REFINE] = refine.result_data(ink.result)
+    judged, why = _evaluated(record, best, ink.result)
+    reasons[EVALUATE] = why if not ink.reasons else ()
+    if judged is not None:
+        data[EVALUATE] = judged.to_dict()
+        best = replace(best, quality={**best.quality, **judged.quality()})
+    circles = comparison.Circles(ink.drawn.marks(base.camera), judged, best, ink.result.tcp_mm)
+    data.update(comparison.table(stages, circles, record.config.robot.arm))
+    return best
+
+
+def _evaluated(
+    record: Record[FullParams], best: Calibration, result: RefineResult
+) -> tuple[Judged | None, tuple[str, ...]]:
+    """The circles that no fit has seen, if it came to them, and why they fail."""
+    part = record.scoped(EVALUATE, record.params.evaluate)
+    if not part.samples(PICTURES):
+        return None, ("no circle was drawn that no fit has seen",)
+    noise = Noise(result.tcp_mm, result.mark_sigma_mm, result.mark_freedom)
+    try:
+        judged = evaluate.solve(part, best, noise)
+    except SolveError as error:
+        return None, (error.message,)
+    return judged, tuple(evaluate.judge(judged, record.params.evaluate))
+
+
+def _stage(stage: Stage) -> dict[str, Any]:
     return {
         "name": stage.name,
         "training_px": stage.training_px,
@@ -120,14 +220,9 @@ def _row(stage: stages.Stage) -> dict[str, Any]:
     }
 
 
-def _part(judged: tuple[str, tuple[str, ...]], data: dict[str, Any]) -> dict[str, Any]:
-    verdict, reasons = judged
-    return {"verdict": verdict, "reasons": list(reasons), **data}
-
-
 PROCEDURE = Procedure(
     name="full",
-    summary="Everything, unattended: intrinsic, hand-eye, projector, and the verdict",
+    summary="Everything, unattended, from the boards to circles that no fit has seen; the verdict",
     params=FullParams,
     moves=True,
     run=run_full,

@@ -16,23 +16,38 @@ SPARES = 0.25
 
 
 async def planned(
-    run: Run, cell: Cell, rig: PenRig, count: int, radius: float, seed: int
+    run: Run,
+    cell: Cell,
+    rig: PenRig,
+    count: int,
+    radius: float,
+    seed: int,
+    *,
+    turned: bool = True,
 ) -> list[PlannedSpot]:
-    """At least `count` spots for circles of `radius` metres, best spread first, then spares.
+    """At least `count` spots for circles of `radius` metres, best spread first, then spares; see
+    `plan_spots`.
 
     A run plans once. With too little free paper it asks a person for a fresh sheet. SolveError
     when not even fresh sheets have the room.
     """
     recorded = run.recall(SPOTS)
     if recorded is None:
-        spots = await _enough(run, cell, rig, count, radius, seed)
+        spots = await _enough(run, cell, rig, count, radius, seed, turned=turned)
         recorded = {"spots": [spot.to_dict() for spot in spots]}
         await run.record(SPOTS, **recorded)
     return [PlannedSpot.from_dict(spot) for spot in recorded["spots"]]
 
 
 async def _enough(
-    run: Run, cell: Cell, rig: PenRig, count: int, radius: float, seed: int
+    run: Run,
+    cell: Cell,
+    rig: PenRig,
+    count: int,
+    radius: float,
+    seed: int,
+    *,
+    turned: bool,
 ) -> list[PlannedSpot]:
     names = [sheet.name for sheet in cell.config.sheets]
     if not names:
@@ -41,7 +56,7 @@ async def _enough(
         used = [(name, spot) for name in names for spot in cell.sheets.spots(name)]
         wanted = count + int(SPARES * count)
         spots: list[PlannedSpot] = await run.call(
-            plan_spots, rig, cell.config, used, wanted, radius, seed
+            plan_spots, rig, cell.config, used, wanted, radius, seed, turned
         )
         if len(spots) >= count:
             return spots

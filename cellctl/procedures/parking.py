@@ -119,7 +119,8 @@ def lit_area(config: CellConfig) -> Array:
 
 
 async def park_again(run: Run, cell: Cell, T_world_camera: Transform, key: str) -> None:
-    """As `park`, but to the posture that this part of the run has parked in before, if it has."""
+    """As `park`, but to the posture that this part of the run has parked in before, if it has and
+    a path leads there."""
     before = run.records(PARKED)
     if not before or any(r["key"] == key for r in before):
         await park(run, cell, T_world_camera, key)
@@ -129,8 +130,12 @@ async def park_again(run: Run, cell: Cell, T_world_camera: Transform, key: str) 
         return
     way = np.array(before[0]["way"])
     await run.checkpoint("the arm moves out of the light")
-    async with run.taking(key):
-        _, taken = await go(run, cell, way[-1:], way)
+    try:
+        async with run.taking(key):
+            _, taken = await go(run, cell, way[-1:], np.vstack([way, gone(run)]))
+    except MotionRefused:
+        await park(run, cell, T_world_camera, key)
+        return
     await run.sample(key, {"way": taken.waypoints.tolist()})
 
 

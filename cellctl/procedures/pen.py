@@ -152,13 +152,16 @@ def circle(rig: PenRig, centre: Array, radius: float) -> Array:
 
 
 def stroke(rig: PenRig, tips: Array, yaw: float, speed_m_s: float) -> Stroke:
-    """The stroke that leads the pen along tips (n, 3). MotionRefused when the arm cannot follow."""
-    start, found = rig.postures(tips[:1, :2], np.array([yaw]), rig.lift)
+    """The stroke that leads the pen along tips (n, 3). MotionRefused when the arm cannot follow, or
+    the guard does not allow it."""
+    start, reached = rig.postures(tips[:1, :2], np.array([yaw]), rig.lift)
     joints, followed = rig.joints(tips, np.full(len(tips), yaw), np.tile(start, (len(tips), 1)))
     jump = np.abs(np.diff(joints, axis=0)).max(initial=0.0)
-    if not (found.all() and followed.all()) or jump > MOST_TURN_RAD:
+    if not (reached.all() and followed.all()) or jump > MOST_TURN_RAD:
         raise MotionRefused("the arm cannot follow this line with the pen upright")
-    return Stroke(joints, speed_m_s)
+    found = Stroke(joints, speed_m_s)
+    rig.guard.check_stroke(found)
+    return found
 
 
 def lifted(guard: Guard, here: Array, speed_m_s: float) -> Stroke | None:

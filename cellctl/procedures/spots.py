@@ -13,6 +13,7 @@ import numpy as np
 from cellctl.config import CellConfig, SheetSection
 from cellctl.geometry import Array, Mask
 from cellctl.procedures.pen import PenRig
+from cellctl.procedures.routing import nearest_first
 from cellctl.store.sheets import Spot
 
 CANDIDATES = 500
@@ -48,12 +49,19 @@ class PlannedSpot:
 
 
 def plan_spots(
-    rig: PenRig, config: CellConfig, used: Used, count: int, radius: float, seed: int
+    rig: PenRig,
+    config: CellConfig,
+    used: Used,
+    count: int,
+    radius: float,
+    seed: int,
+    turned: bool = True,
 ) -> list[PlannedSpot]:
     """Up to `count` spots for circles of `radius` metres, far from each other, best spread first.
 
-    The tool's yaw changes from spot to spot as far as the guard allows, so that what is off at the
-    tool can be told from what is off in the cell.
+    With `turned` the tool's yaw changes from spot to spot as far as the guard allows, so that what
+    is off at the tool can be told from what is off in the cell; without, it is 0 where the guard
+    allows that.
     """
     rng = np.random.default_rng(seed)
     xy = _candidates(config, rng)
@@ -67,7 +75,7 @@ def plan_spots(
     chosen = _spread(xy, np.logical_or.reduce(allowed, axis=1), count, 2 * radius + MARGIN_M)
     spots = []
     for place, i in enumerate(chosen):
-        turn = next(k for k in _order(place) if allowed[i, k])
+        turn = next(k for k in _order(place if turned else 0) if allowed[i, k])
         name, yaw = config.sheets[owner[i]].name, float(np.radians(YAWS_DEG[turn]))
         spots.append(PlannedSpot(name, xy[i], yaw, above[i, turn]))
     return spots
@@ -104,16 +112,17 @@ def _sheet_of(sheets: Sequence[SheetSection], xy: Array, radius: float) -> Array
 
 def _postures(rig: PenRig, xy: Array, radius: float) -> tuple[Mask, Array]:
     """At which of YAWS_DEG the pen may be lowered to each of xy (n, 2): (n, yaws), and the joints
-    (n, yaws, 6) above. Looked at on both sides of the circle, along x."""
+    (n, yaws, 6) above. Looked at on four sides of the circle, by a cautious guard."""
     n, turns = len(xy), len(YAWS_DEG)
     places = np.repeat(xy, turns, axis=0)
     yaw = np.tile(np.radians(YAWS_DEG), n)
-    above, good = rig.postures(places + (radius, 0.0), yaw, rig.lift)
+    above, good = rig.postures(places, yaw, rig.lift)
     allowed = good.copy()
-    allowed[good] = rig.guard.free(above[good])
-    for side in (-radius, radius):
-        down, found = rig.postures(places[allowed] + (side, 0.0), yaw[allowed], -rig.depth)
-        allowed[allowed] = np.logical_and(found, rig.guard.draws(down))
+    guard = rig.guard.cautious(rig.posture)
+    allowed[good] = guard.free(above[good])
+    for side in radius * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+        down, found = rig.postures(places[allowed] + side, yaw[allowed], -rig.depth)
+        allowed[allowed] = np.logical_and(found, guard.draws(down))
     return allowed.reshape(n, turns), above.reshape(n, turns, -1)
 
 
@@ -135,3 +144,14 @@ def _spread(xy: Array, allowed: Mask, count: int, spacing: float) -> list[int]:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(xy - xy[chosen[-1]], axis=1))
     return chosen
+
+
+def in_order(rig: PenRig, spots: list[PlannedSpot], chunk: int) -> list[PlannedSpot]:
+    """The spots, `chunk` by `chunk`, each chunk as the arm gets around in it soonest."""
+    ordered: list[PlannedSpot] = []
+    here = rig.posture
+    for start in range(0, len(spots), chunk):
+        some = spots[start : start + chunk]
+        ordered += [some[i] for i in nearest_first(here, np.array([s.joints for s in some]))]
+        here = ordered[-1].joints
+    return ordered

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cellctl.geometry import Array
 from cellctl.sim.bodies import plate_points, sheet
-from cellctl.sim.grid import touched_height
+from cellctl.sim.grid import drawing_joints, touched_height
 from cellctl.sim.presets import Preset
 from cellctl.sim.textures import description
 from cellctl.sim.truth import STREAMS, Truth, draw, sheet_rectangle, tape_error
@@ -134,6 +134,7 @@ def _pen(truth: Truth) -> dict[str, Any]:
         "travel_m": truth.preset.pen.travel_m,
         "line_m": truth.preset.pen.line_m,
         "feels_contact": True,
+        "posture_deg": _rounded(np.degrees(_drawing_posture(truth)), 1),
     }
 
 
@@ -147,6 +148,12 @@ def _projector(preset: Preset) -> dict[str, Any]:
         "centre_px": list(projector.centre_px),
         "latency_s": round(latency, 3),
     }
+
+
+def _drawing_posture(truth: Truth) -> Array:
+    """Joints (6,) with the pen over the middle of the table, on the branch that draws."""
+    middle = np.array([truth.preset.table.centre_m[:2]])
+    return drawing_joints(truth, middle, truth.preset.table.centre_m[2])[0]
 
 
 def _mount(truth: Truth, name: str, pose: dict[str, list[float]]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from cellctl.geometry import Array, Transform
 from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.link import ANSWER_S, Link, SimClock
 
-SLICE_S = 0.05
+SLICES_S = {"paced": 0.05, "stepped": 0.25}
 """Cell time of one wait for the arm; what a stop may have to wait for."""
 STANDSTILL_S = 0.1
 """All measured joint speeds zero for this long is standstill: an arm that rings slowly passes
@@ -61,6 +61,7 @@ class SimRobot:
     def __init__(self, endpoint: Endpoint, config: CellConfig, clock: SimClock) -> None:
         self._link = Link("robot", endpoint.cell, clock)
         self._config, self._tally = config.robot, Tally()
+        self._slice_s = SLICES_S[endpoint.time]
         self._feels_contact = config.bracket.pen.feels_contact
 
     async def identity(self) -> Identity:
@@ -156,7 +157,7 @@ class SimRobot:
         began: float | None = None
         while True:
             header, _ = await self._link.request(
-                "robot.wait", standstill_s=STANDSTILL_S, timeout_s=SLICE_S
+                "robot.wait", standstill_s=STANDSTILL_S, timeout_s=self._slice_s
             )
             if header["standstill_s"] >= STANDSTILL_S:
                 if faults and header["fault"]:

@@ -1,0 +1,161 @@
+"""The table's surface, felt with the pen: a plane, how sure it is, and its bow.
+
+Where neither arm nor pen holder feels a contact, an operator jogs the pen to the table and says so.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from cellctl.calib import table
+from cellctl.calib.calibration import Calibration
+from cellctl.calib.table import TableResult
+from cellctl.cell import Cell
+from cellctl.drivers.base import RobotState
+from cellctl.errors import BadInput
+from cellctl.geometry import Array, Transform
+from cellctl.procedures import paper, pen_motion
+from cellctl.procedures.knowledge import table_plane
+from cellctl.procedures.moving import posture
+from cellctl.procedures.pen import pen_rig
+from cellctl.procedures.record import Record, recorded
+from cellctl.procedures.spots import PlannedSpot, area, in_order
+from cellctl.run import CANCEL, Procedure, Result, Run, StepCancelled
+from cellctl.store.history import Sample
+
+TOUCHES = "touches"
+DOT_M = 0.004
+"""Paper that a touch takes, as a radius."""
+TOUCH_SPEED_M_S = 0.02
+DEEPEST = 0.9
+"""Share of its travel by which a pen that feels nothing is pushed down."""
+TAKEN = "the pen touches"
+
+
+class MeasureTableParams(BaseModel):
+    """`touches` places on the table; `seed` spreads them otherwise. `max_uncertainty_mm` is what
+    the height may be uncertain by anywhere in the area, with 95 % confidence."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    touches: int = Field(default=12, ge=6, le=60)
+    seed: int = Field(default=0, ge=0)
+    max_uncertainty_mm: float = Field(default=1.0, gt=0)
+
+
+async def collect(run: Run, cell: Cell, params: MeasureTableParams) -> None:
+    """Touch the table; the samples are in the run."""
+    rig = pen_rig(cell.config, cell.guard, table_plane(cell.config), await posture(run, cell))
+    await run.step(TOUCHES, params.touches)
+    spots = await paper.planned(run, cell, rig, params.touches, DOT_M, params.seed)
+    hubs = np.array([spot.joints for spot in spots])
+    for i, spot in enumerate(in_order(rig, spots, params.touches)):
+        done = sum("T_world_flange" in sample.data for sample in run.samples().values())
+        run.progress(done)
+        if done >= params.touches:
+            break
+        key = f"touch-{i:03}"
+        if paper.cut_short(run, cell, key):
+            await run.sample(key, {"flaw": "cut short", **spot.to_dict()})
+        elif key in run.samples():
+            continue
+        elif cell.config.bracket.pen.feels_contact:
+            await _feel(run, cell, rig, key, spot, hubs)
+        else:
+            await _ask(run, cell, key, spot)
+
+
+async def _feel(run: Run, cell: Cell, rig: Any, key: str, spot: PlannedSpot, hubs: Array) -> None:
+    await run.checkpoint(f"the pen touches the table ({key})")
+    below = DEEPEST * cell.config.bracket.pen.travel_m
+    async with run.taking(key):
+        stroke, way = await pen_motion.over_touch(
+            run, cell, rig, spot, below, TOUCH_SPEED_M_S, hubs
+        )
+        await paper.claim(run, cell, key, spot, DOT_M)
+        state = await pen_motion.touch(run, cell, stroke)
+    await paper.settle(run, cell, key, spot)
+    await run.sample(key, {**_touched(state, spot), "way": way.waypoints.tolist()})
+
+
+async def _ask(run: Run, cell: Cell, key: str, spot: PlannedSpot) -> None:
+    x, y = 1e3 * spot.xy
+    answer = await run.ask(
+        f"{key}: jog the pen until it just touches the table near x = {x:.0f} mm, y = {y:.0f} mm",
+        [TAKEN, CANCEL],
+    )
+    if answer == CANCEL:
+        raise StepCancelled
+    await run.sample(key, _touched(await cell.robot.read(), spot))
+
+
+def _touched(state: RobotState, spot: PlannedSpot) -> dict[str, Any]:
+    return {
+        **spot.to_dict(),
+        "T_world_flange": state.T_world_flange.to_list(),
+        "t": state.t,
+    }
+
+
+def seen(record: Record[MeasureTableParams]) -> dict[str, Array]:
+    """Where the pen's tip, as the config has it, stood at each contact: (3,) in the world."""
+    tip = np.array(record.config.bracket.pen.tip_m)
+    samples = sorted(record.samples(TOUCHES).items())
+    return {key: _tip(sample, tip) for key, sample in samples if "flaw" not in sample.data}
+
+
+def _tip(sample: Sample, tip: Array) -> Array:
+    try:
+        pose = Transform("world", "flange", sample.data["T_world_flange"])
+    except (KeyError, BadInput) as error:
+        raise BadInput(f"sample {sample.key}: T_world_flange: {error}") from None
+    return pose.apply(tip)
+
+
+def solve(record: Record[MeasureTableParams]) -> TableResult:
+    """Pure: the surface through the touched points."""
+    touched = seen(record)
+    low, high = area(record.config)
+    points = np.array(list(touched.values())).reshape(-1, 3)
+    return table.solve_table(points, ids=tuple(touched), area=(low, high))
+
+
+def judge(result: TableResult, params: MeasureTableParams) -> tuple[str, tuple[str, ...]]:
+    """Pass or fail, with reasons."""
+    limits = table.TableLimits(uncertainty_m=1e-3 * params.max_uncertainty_mm)
+    return table.judge(result, limits)
+
+
+def conclude(record: Record[MeasureTableParams]) -> Result:
+    """Pure: from what was recorded to the surface; with an active calibration, that one with this
+    table."""
+    result = solve(record)
+    _, reasons = judge(result, record.params)
+    data = {"kind": "measure-table", **result.to_dict()}
+    return Result.judged(reasons, data, _calibration(record, result))
+
+
+def _calibration(record: Record[Any], result: TableResult) -> dict[str, Any] | None:
+    if record.active is None:
+        return None
+    active = Calibration.from_dict(record.active, "active calibration")
+    return active.on(result.surface).to_dict()
+
+
+async def run_measure_table(run: Run, cell: Cell, params: MeasureTableParams) -> Result:
+    """Collect, solve, judge."""
+    await collect(run, cell, params)
+    return await run.call(conclude, recorded(run, cell.config, params))
+
+
+PROCEDURE = Procedure(
+    name="measure-table",
+    summary="Table: touches it with the pen; plane, uncertainty and bow",
+    params=MeasureTableParams,
+    moves=True,
+    run=run_measure_table,
+    conclude=conclude,
+)
