@@ -27,6 +27,8 @@ JUDGED = 0.6
 """Share of the line that must carry ink at all."""
 HALF = 0.4
 """With less ink than that, what is there need not be the circle."""
+ARC = 0.5
+"""Share of its ink that a half-drawn circle has in one piece; chance lines have less."""
 RADII = (0.5, 1.5)
 """Circles of that many times the commanded radius are told."""
 RADIUS_STEP_PX, RADIUS_STEP = 1.2, 0.06
@@ -34,8 +36,9 @@ EACH = 10
 """So many rings at most are looked at for each expected one."""
 WEAKER = 0.35
 """... and none that has less than that share of the best one's votes."""
-ROUND_PX = 0.7
-"""A line that leaves the fitted circle by more, rms, is no circle."""
+ROUND_PX = 0.3
+"""A line that leaves the fitted circle by more, rms, is no circle; noise adds to it. A pen's
+tremor is a tenth of a pixel, and so is the plane's tilt when it is wrong by 10 degrees."""
 SAME_PX = 2.0
 LEAST_RADIUS_PX = 3.0
 COARSE_ANGLES, COARSE_WIDTHS = 36, (1.6, 1.3)
@@ -155,7 +158,8 @@ def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
     fine = fit_rings(
         picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles
     )
-    sound = (fine.rms_px < ROUND_PX) & (fine.ink > HALF / 2)
+    allowed = ROUND_PX + picture.noise / np.maximum(fine.depth, picture.noise)
+    sound = (fine.rms_px < allowed) & (fine.ink > HALF / 2)
     return fine[_distinct(fine, view, sound)]
 
 
@@ -214,8 +218,8 @@ def _answer(rings: Rings, number: int, view: PlaneView) -> Circle | Unseen:
     if not _whole(rings)[number]:
         if ink + hidden >= WHOLE and hidden > 0.15:
             return Unseen(f"glare or print hides {100 * hidden:.0f} % of its line")
-        if ink < HALF:
-            return Unseen(f"{NO_INK}, but for lines along {100 * ink:.0f} % of one")
+        if ink < HALF or rings.arc[number] < ARC * rings.complete[number]:
+            return Unseen(f"{NO_INK}, but for pieces of lines along {100 * ink:.0f} % of one")
         return Unseen(f"half drawn: ink on {100 * rings.complete[number]:.0f} % of its line")
     place = rings.centres[number]
     centre_px = view.pixels(place)

@@ -49,13 +49,15 @@ class Picture:
 class Rings:
     """Fitted rings side by side: `centres` (n, 2) and `radii` (n,) in metres on the plane;
     `ink`, `hidden` (n,), shares of the circumference with ink, and that cannot be judged;
-    `depth` (n,), the line's median depth in grey levels; `rms_px`, `sigma_px` (n,), of the
+    `arc` (n,), share of the longest piece without a gap; `depth` (n,), the line's median depth
+    in grey levels; `rms_px`, `sigma_px` (n,), of the
     line's points about the circle, and one standard deviation of the centre per axis."""
 
     centres: Array
     radii: Array
     ink: Array
     hidden: Array
+    arc: Array
     depth: Array
     rms_px: Array
     sigma_px: Array
@@ -95,6 +97,8 @@ def fit_rings(
     widths: tuple[float, ...] = WIDTHS,
 ) -> Rings:
     """Rings fitted from starts `centres` (n, 2), `radii` (n,), right to about two pixels."""
+    if not len(radii):
+        return Rings(centres, *np.zeros((7, 0)))
     theta = 2.0 * np.pi * np.arange(angles) / angles
     spokes = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     design = np.column_stack([spokes, np.ones(angles)])
@@ -210,11 +214,13 @@ def _measured(
     spacing = 2.0 * np.pi * radii / pixel_m / len(design)
     alike = np.maximum(CORRELATED_PX / spacing, 1.0)  # neighbours that share their noise
     depth = np.nan_to_num(_median(np.where(used, profiles.depth, np.nan)))
+    hidden = _hidden(profiles, inked, depth)
     return Rings(
         centres=centres,
         radii=radii,
         ink=inked.mean(axis=1),
-        hidden=_hidden(profiles, inked, depth).mean(axis=1),
+        hidden=hidden.mean(axis=1),
+        arc=_longest(inked | hidden),
         depth=depth,
         rms_px=rms,
         sigma_px=rms * np.sqrt(spread * alike),
@@ -227,3 +233,11 @@ def _hidden(profiles: _Profiles, inked: Mask, depth: Array) -> Mask:
     paper = _median(np.where(inked, profiles.sides, np.nan))
     dark = profiles.centre < (paper - 0.5 * depth)[:, None]
     return ~inked & (profiles.blind | dark)
+
+
+def _longest(line: Mask) -> Array:
+    """(n,): share of each circle (n, k) that its longest piece without a gap takes."""
+    twice = np.concatenate([line, line], axis=1)
+    number = np.arange(twice.shape[1])
+    last_gap = np.maximum.accumulate(np.where(twice, -1, number), axis=1)
+    return np.minimum((number - last_gap).max(axis=1) / line.shape[1], 1.0)

@@ -17,7 +17,7 @@ from cellctl.calib.circles import Circle, Expected, find_circles
 from cellctl.calib.printed import Unseen
 from cellctl.errors import BadInput, CellctlError, SolveError
 from cellctl.geometry import Array
-from tests.calib.ink import CR, IR, Block, Light, Ring, Sheet, Stroke, above
+from tests.calib.ink import CR, IR, Block, Light, Ring, Sheet, Stroke, above, noisy
 
 R, LINE = 0.010, 0.0008
 """A circle of the small cell, metres."""
@@ -65,8 +65,8 @@ def lettering(low: tuple[float, float], high: tuple[float, float], seed: int = 0
     """Print that fills a box: words of strokes and small bows, 3 mm high."""
     rng = np.random.default_rng(seed)
     things: list[Any] = []
-    for y in np.arange(low[1], high[1], 0.006):
-        for x in np.arange(low[0], high[0], 0.0025):
+    for y in np.arange(low[1], high[1], 0.008):
+        for x in np.arange(low[0], high[0], 0.003):
             if rng.random() < 0.2:
                 continue
             if rng.random() < 0.3:
@@ -188,13 +188,14 @@ def test_nothing_is_found_where_nothing_was_drawn():
     """Print, text, light and glare, but no circle of about that radius."""
     places = spots((7, 5), 0.055, 0.003)
     things: list[Any] = [Ring(x, y, 0.015, 0.0015, ink=-0.5) for x, y in places]
-    things += lettering((-0.2, -0.16), (-0.04, 0.16))
+    things += lettering((-0.2, -0.06), (-0.1, 0.06))
     things += [Block((x + 0.01, y), (x + 0.016, y + 0.006)) for x, y in places]
     things += [Ring(x, y, 0.024, LINE) for x, y in places[::3]]
-    things += [Stroke((-0.3, y), (0.3, y), 0.0005) for y in np.arange(-0.15, 0.15, 0.007)]
+    things += [Stroke((-0.05, y), (0.06, y), 0.0005) for y in np.arange(-0.1, 0.1, 0.007)]
     sheet = replace(SHEET, light=Light(glare=160.0, at=(0.1, 0.05), radius=0.05))
+    clean = sheet.clean(things)
     for seed in range(3):
-        found = find(sheet.picture(things, seed=seed), wanted(places), search_m=0.02)
+        found = find(noisy(clean, seed), wanted(places), search_m=0.02)
         assert all(isinstance(value, Unseen) for value in found.values())
 
 
@@ -248,7 +249,7 @@ def test_another_radius_is_told():
 def test_the_right_radius_is_preferred():
     """Printed circles about the same centre, next to the drawn one."""
     places = spots((5, 4), 0.05, 0.003)
-    printed = rings(places + 0.0005, 0.0075) + rings(places, 0.0135)
+    printed = rings(places + 0.0004, 0.0062) + rings(places, 0.0135)
     found = find(SHEET.picture(rings(places) + printed), wanted(places - 0.004))
     assert [c.radius_m for c in found.values()] == pytest.approx([R] * 20, rel=0.01)
     assert rms(errors(found, places)) < 0.05
@@ -267,8 +268,9 @@ def test_an_old_whole_circle_does_not_stand_in_for_a_half_one():
 def test_what_was_there_before_does_not_count():
     places = spots((5, 4), 0.05, 0.003)
     there: list[Any] = [*rings(places[::2] + 0.002), *lettering((-0.05, -0.05), (0.05, 0.05))]
-    before = SHEET.picture(there, seed=1)
-    same = find(SHEET.picture(there, seed=2), wanted(places), before=before)
+    clean = SHEET.clean(there)
+    before = noisy(clean, 1)
+    same = find(noisy(clean, 2), wanted(places), before=before)
     assert all(isinstance(value, Unseen) for value in same.values())
     drawn = SHEET.picture([*there, *rings(places)], seed=3)
     assert rms(errors(find(drawn, wanted(places), before=before), places)) < 0.1
