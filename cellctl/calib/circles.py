@@ -31,7 +31,7 @@ ARC = 0.5
 """Share of its ink that a half-drawn circle has in one piece; chance lines have less."""
 RADII = (0.5, 1.5)
 """Circles of that many times the commanded radius are told."""
-RADIUS_STEP_PX, RADIUS_STEP = 1.2, 0.06
+RADIUS_STEP_PX, RADIUS_STEP = 1.0, 0.06
 EACH = 10
 """So many rings at most are looked at for each expected one."""
 WEAKER = 0.35
@@ -41,7 +41,7 @@ ROUND_PX = 0.3
 tremor is a tenth of a pixel, and so is the plane's tilt when it is wrong by 10 degrees."""
 SAME_PX = 2.0
 LEAST_RADIUS_PX = 3.0
-COARSE_ANGLES, COARSE_WIDTHS = 36, (1.6, 1.3)
+COARSE_ANGLES, COARSE_WIDTHS = 36, (1.15, 1.0, 1.0)
 SATURATED = 249.0
 LEAST_NOISE = 0.3
 
@@ -155,9 +155,7 @@ def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
     coarse = coarse[_distinct(coarse, view, coarse.ink > HALF / 2)]
     circumference = 2.0 * np.pi * np.median(wanted.radii) / np.median(view.pixel_m(wanted.centres))
     angles = int(np.clip(circumference, 64, 160))
-    fine = fit_rings(
-        picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles
-    )
+    fine = fit_rings(picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles)
     allowed = ROUND_PX + picture.noise / np.maximum(fine.depth, picture.noise)
     sound = (fine.rms_px < allowed) & (fine.ink > HALF / 2)
     return fine[_distinct(fine, view, sound)]

@@ -14,7 +14,7 @@ from cellctl.geometry import Array, Mask, invert, rigid, transform_points
 NODES = 8
 """A flat picture is interpolated between exact places every so many cells: a lens bends the
 picture over that length by 0.002 px."""
-MOST_CELLS = 6_000_000
+MOST_CELLS, LONGEST = 6_000_000, 16_000
 RIM = 1.05
 """Rays further off the axis than the picture's by that factor have no picture: there a
 distortion polynomial may fold back into it."""
@@ -72,7 +72,8 @@ class PlaneView:
         """(...): whether pixels (..., 2) lie in the picture, `margin` px off its edge."""
         size = np.array(self.camera.image_size)
         with np.errstate(invalid="ignore"):
-            return ((pixels >= margin) & (pixels <= size - 1 - margin)).all(axis=-1)
+            within = (pixels >= margin) & (pixels <= size - 1 - margin)
+        return np.asarray(within.all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,8 @@ class Flat:
 def flatten(view: PlaneView, image: Array, low: Array, high: Array, cell_m: float) -> Flat:
     """The part of `image` (h, w) that shows the rectangle from `low` to `high`, (2,) metres on
     the plane. Cells grow where the rectangle would have more than MOST_CELLS of them."""
-    cell_m = max(cell_m, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
+    least = max(np.sqrt(np.prod(high - low) / MOST_CELLS), (high - low).max() / LONGEST)
+    cell_m = max(cell_m, float(least))
     columns, rows = np.ceil((high - low) / cell_m / NODES).astype(int) + 1
     x = low[0] + cell_m * (NODES * np.arange(-1, columns + 1) + (NODES - 1) / 2)
     y = low[1] + cell_m * (NODES * np.arange(-1, rows + 1) + (NODES - 1) / 2)
@@ -101,8 +103,9 @@ def flatten(view: PlaneView, image: Array, low: Array, high: Array, cell_m: floa
     size = ((columns + 2) * NODES, (rows + 2) * NODES)
     pixels = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)[NODES:-NODES, NODES:-NODES]
     seen = view.inside(pixels)
-    pixels = np.where(seen[..., None], pixels, np.float32(-1.0))
-    values = cv2.remap(image, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pixels = np.where(seen[..., None], pixels, -1.0)
+    x_map, y_map = (np.ascontiguousarray(pixels[..., i], dtype=np.float32) for i in (0, 1))
+    values = cv2.remap(image, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return Flat(np.asarray(values, dtype=np.float32), seen, low.astype(float), cell_m)
 
 

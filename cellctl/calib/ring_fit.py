@@ -19,7 +19,11 @@ from cellctl.geometry import Array, Mask
 BLUR_PX = 0.75
 """What a lens and a pixel's own width add to a line, standard deviation."""
 STEP_PX = 0.5
-REACH = 3.2
+SIDE = 1.7
+"""The line's sides begin that many standard deviations off it."""
+DIP = 0.3
+"""A line is darker than both of its sides by that share of its depth."""
+REACH = 2.6
 """Half the length of a profile, in standard deviations of the line."""
 CLEAR = 4.0
 """Ink is darker than its sides by so many times the noise ..."""
@@ -27,8 +31,9 @@ PALE = 0.35
 """ ... and by that share of the line's median depth."""
 OFF_PX = 1.0
 """Ink that far off the fitted circle is not the circle's line."""
-WIDTHS = (1.6, 1.3, 1.0, 1.0, 1.0, 1.0)
-"""From wide profiles, which find the line from afar, to those as wide as the line."""
+WIDTHS = (1.0,) * 5
+"""Of the profiles of each round, in those of the line; wider ones find it from further away, but
+run into neighbours."""
 TUKEY = 4.7
 LEAST_SCALE_PX = 0.04
 CORRELATED_PX = 1.5
@@ -77,10 +82,12 @@ class Rings:
 @dataclass(frozen=True, eq=False)
 class _Profiles:
     """Lines across each ring (n, k): `off` px outward of the circle, `depth` in grey levels,
-    `centre`, the grey level on the circle, `sides`, that of the paper beside it, `blind`."""
+    `dip`, by how much the line is darker than the darker one of its sides, `centre`, the grey
+    level on the circle, `sides`, that of the paper beside it, `blind`."""
 
     off: Array
     depth: Array
+    dip: Array
     centre: Array
     sides: Array
     blind: Mask
@@ -130,7 +137,7 @@ def _profiles(
     outward = pixel_m[:, None, None, None] * t[[0, count, -1], None] * spokes[:, None]
     ends = view.pixels(on_line[:, :, None] + outward)
     pixels = _parabolas(t / t[-1]) @ ends
-    unseen = ~view.inside(ends, 1.0).all(axis=-1)
+    unseen = np.asarray(~view.inside(ends, 1.0).all(axis=-1))
     pixels = np.nan_to_num(pixels)
     values = np.asarray(sample(picture.values, pixels), dtype=float)
     level, _, depth, shift = np.moveaxis(values @ _bell_solver(t, middle).T, -1, 0)
@@ -138,7 +145,17 @@ def _profiles(
         off = np.where(depth > 0, shift / depth, np.nan)
     if picture.blind is not None:
         unseen |= sample(picture.blind, pixels[:, :, count]) > 0.25
-    return _Profiles(off, depth, values[..., count], level, unseen)
+    dip = _dip(values, np.abs(t) <= OFF_PX, np.abs(t) >= SIDE * middle)
+    return _Profiles(off, depth, dip, values[..., count], level, unseen)
+
+
+def _dip(values: Array, on_line: Mask, beside: Mask) -> Array:
+    """(n, k): how far profiles (n, k, t) go down within the line from their darker end. A
+    shoulder of something bright, or a step, goes down on one side only."""
+    half = values.shape[-1] // 2
+    inner, outer = values[..., :half][..., beside[:half]], values[..., -half:][..., beside[-half:]]
+    lowest = values[..., on_line].min(axis=-1)
+    return np.minimum(inner.mean(axis=-1), outer.mean(axis=-1)) - lowest
 
 
 def _parabolas(u: Array) -> Array:
@@ -157,7 +174,7 @@ def _bell_solver(t: Array, sigma: float) -> Array:
 def _inked(profiles: _Profiles, noise: float, off_px: float) -> Mask:
     """(n, k): where the ring has its line."""
     depth = np.where(profiles.blind, 0.0, profiles.depth)
-    clear = depth > CLEAR * noise
+    clear = (depth > CLEAR * noise) & (profiles.dip > DIP * depth)
     usual = _median(np.where(clear, depth, np.nan))
     deep = depth > PALE * np.nan_to_num(usual, nan=np.inf)[:, None]
     with np.errstate(invalid="ignore"):

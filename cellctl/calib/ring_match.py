@@ -28,7 +28,12 @@ FORBIDDEN = 1e6
 
 
 def match_rings(
-    wanted: Array, wanted_radii: Array, found: Array, found_radii: Array, whole: Mask, search_m: float
+    wanted: Array,
+    wanted_radii: Array,
+    found: Array,
+    found_radii: Array,
+    whole: Mask,
+    search_m: float,
 ) -> Array:
     """(n,) for each of the rings expected at `wanted` (n, 2) with `wanted_radii` (n,), metres, the
     number of its ring among those `found` (m, 2), or -1.

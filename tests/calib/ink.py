@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
-from cellctl.geometry import Array, look_down, invert
+from cellctl.geometry import Array, invert, look_down
 
 PAPER = 190.0
 SUPERSAMPLE = 6

@@ -352,9 +352,7 @@ def test_a_plane_that_the_camera_does_not_look_at(height):
     T = SHEET.T.copy()
     T[:3, 3] = (0.0, 0.0, height)
     with pytest.raises(SolveError, match=r"behind the camera|stands in the plane"):
-        find_circles(
-            BLANK, SMALL, T, wanted(np.zeros((1, 2))), search_m=0.01, line_m=LINE
-        )
+        find_circles(BLANK, SMALL, T, wanted(np.zeros((1, 2))), search_m=0.01, line_m=LINE)
 
 
 NUMBERS = st.floats(-3.0, 3.0) | st.sampled_from([float("nan"), float("inf"), 1e300, -1e-300])
