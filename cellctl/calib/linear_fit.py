@@ -78,7 +78,8 @@ class LinearFit:
         as far off once in 1 / PROBABILITY times. An F test of each block's deletion, Bonferroni's
         correction."""
         n, b = self.residuals.shape
-        drop = np.where(np.isfinite(self.held_out), self.residuals * self.held_out, 0.0).sum(axis=1)
+        held_out = np.where(np.isfinite(self.held_out), self.held_out, 0.0)
+        drop = (self.residuals * held_out).sum(axis=1)
         worst = int(np.argmax(drop))
         spare = self.spare - b + noise.weight
         if spare <= 0 or drop[worst] <= 0:

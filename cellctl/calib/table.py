@@ -123,11 +123,13 @@ def _trusted(points: Array, touched: Area) -> Array:
 
 def _choice(fits: dict[str, LinearFit]) -> str:
     """The simplest kind that predicts left-out touches as well as the best."""
-    best = min(fits.values(), key=lambda fit: float(np.square(fit.held_out).sum()))
-    for kind, fit in fits.items():
-        if fit is best or excess(list(fit.held_out), list(best.held_out)) <= 0.0:
-            return kind
-    raise AssertionError("the best one is among them")
+    tried = {k: fit for k, fit in fits.items() if k == "plane" or np.isfinite(fit.held_out).all()}
+    best = min(tried, key=lambda kind: float(np.square(tried[kind].held_out).sum()))
+    if best == "plane":
+        return best
+    squares = list(tried[best].held_out)
+    good = (k for k, fit in tried.items() if k == best or excess(list(fit.held_out), squares) <= 0)
+    return next(good)
 
 
 def _with_rejections(

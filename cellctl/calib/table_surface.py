@@ -52,8 +52,8 @@ class TableSurface:
 
     `covariance` (p, p) m^2 of the coefficients, `spare` the residuals beyond the p needed;
     `held_out_mm` of every kind that was tried, `kind` the chosen one. `bow_m`: the largest
-    distance of the surface from its plane over `area`; `uncertainty_m`: 95 % of the height, at
-    the place of `area` where it is known worst, for the surface as it was fitted.
+    distance of the surface from its plane over `area`; `uncertainty_m`: with 95 % the height is
+    nowhere in `area` off by more, for the surface as it was fitted.
     """
 
     kind: str
@@ -97,13 +97,17 @@ class TableSurface:
 
     @property
     def uncertainty_m(self) -> float:
-        return float(self.uncertainty_at(self.area.grid()).max())
+        # Off most in a corner, if it is off: Bonferroni's interval for the four of them.
+        return float(_interval(self.spare, 4) * self._sigma(self.area.grid()).max())
 
     def uncertainty_at(self, xy: ArrayLike) -> Array:
         """Half of the 95 % interval (n,) of the height at places (n, 2), metres."""
-        basis = self._basis(np.asarray(xy, dtype=float))
+        return _interval(self.spare) * self._sigma(np.asarray(xy, dtype=float))
+
+    def _sigma(self, places: Array) -> Array:
+        basis = self._basis(places)
         variance = np.einsum("ni,ij,nj->n", basis, self.covariance, basis)
-        return _t95(self.spare) * np.sqrt(np.maximum(variance, 0.0))
+        return np.sqrt(np.maximum(variance, 0.0))
 
     def _basis(self, places: Array) -> Array:
         return basis(places, self.touched, self.kind)
@@ -175,10 +179,11 @@ def numbers(value: Any, name: str, shape: tuple[int | None, ...]) -> Array:
     return array
 
 
-def _t95(spare: int) -> float:
-    """Half the 95 % interval in standard deviations, when these come from `spare` residuals; from
-    none, they are an opinion and taken as certain."""
-    return float(stats.t.ppf(0.975, spare) if spare > 0 else stats.norm.ppf(0.975))
+def _interval(spare: int, places: int = 1) -> float:
+    """Half the 95 % interval in standard deviations, for so many places at once, when these come
+    from `spare` residuals; from none, they are an opinion and taken as certain."""
+    tail = 0.025 / places
+    return float(stats.t.isf(tail, spare) if spare > 0 else stats.norm.isf(tail))
 
 
 def _read(value: dict[str, Any]) -> TableSurface:

@@ -42,7 +42,8 @@ class PivotPose:
 class PivotResult:
     """`tip` (3,) in the flange's frame and `point` (3,) in the base's, metres; `covariance` (3, 3)
     of the tip, m^2. `weak_axis` (3,) is the direction in the flange's frame that the poses tilted
-    least, `tilt_deg`, by how much: along it the tip is known worst. `condition`: of the equations."""
+    least, `tilt_deg`, by how much: along it the tip is known worst. `condition`: that of the
+    equations, columns scaled."""
 
     tip: Array
     covariance: Array
@@ -188,7 +189,7 @@ def axis_name(axis: Array) -> str:
 def _checked(poses: ArrayLike, ids: Sequence[str] | None) -> tuple[Array, list[str]]:
     try:
         count = len(poses)  # type: ignore[arg-type] # what has no length is refused below
-        checked = [rigid(pose, f"pose {i + 1}") for i, pose in enumerate(poses)]  # type: ignore[arg-type, union-attr]
+        checked = [rigid(pose, f"pose {i + 1}") for i, pose in enumerate(poses)]  # type: ignore[arg-type]
     except TypeError:
         raise BadInput("poses must be a list of 4x4 matrices T_base_flange") from None
     names = [str(i + 1) for i in range(count)] if ids is None else list(ids)

@@ -58,7 +58,7 @@ def test_a_bow_is_recovered():
     surface = solve_table(touches(16, bow_m=1e-3), area=AREA)
     xy = AREA.grid()
     assert surface.kind == "bow"
-    assert np.abs(surface.height(xy) - truth(xy, 1e-3)).max() < surface.uncertainty_m
+    assert np.abs(surface.height(xy) - truth(xy, 1e-3)).max() < 1.5e-4
     assert surface.uncertainty_m < 3e-4
     assert surface.bow_m == pytest.approx(1e-3 * 2 / 3, rel=0.2)
     assert surface.held_out_mm["bow"] < 0.5 * surface.held_out_mm["plane"]
@@ -95,9 +95,10 @@ def test_uncertainty_is_the_scatter_of_repeated_solves(count, bow_m):
     assert len(surfaces) > 200
     places = AREA.grid()[::20]
     off = np.array([s.height(places) - truth(places, bow_m) for s in surfaces])
-    inside = np.array([np.abs(o) <= s.uncertainty_at(places) for o, s in zip(off, surfaces)])
-    assert inside.mean() == pytest.approx(0.95, abs=0.03)
-    assert np.mean([np.abs(o).max() <= s.uncertainty_m for o, s in zip(off, surfaces)]) > 0.9
+    intervals = np.array([s.uncertainty_at(places) for s in surfaces])
+    anywhere = np.array([s.uncertainty_m for s in surfaces])
+    assert np.mean(np.abs(off) <= intervals) == pytest.approx(0.95, abs=0.03)
+    assert 0.93 < np.mean(np.abs(off).max(axis=1) <= anywhere) < 0.995
 
 
 def test_the_planes_covariance_is_the_scatter():
@@ -141,8 +142,8 @@ def test_verdict():
     verdict, reasons = judge(solve_table(touches(4), area=AREA))
     assert verdict == "fail"
     assert any("only 4 touches" in reason for reason in reasons)
-    middle = touches(9)
-    middle[:, :2] = 0.08 * (middle[:, :2] - middle[:, :2].mean(axis=0)) + (0.0, -0.44)
+    middle = touches(9, noise_m=2e-4)
+    middle[:, :2] = 0.1 * (middle[:, :2] - middle[:, :2].mean(axis=0)) + (0.0, -0.44)
     verdict, reasons = judge(solve_table(middle, area=AREA))
     assert verdict == "fail"
     assert any("near the area's edges" in reason for reason in reasons)
@@ -209,7 +210,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(key=st.sampled_from(sorted(VALUE)), value=JSON)
 def test_whatever_is_read(key, value):
     try:
