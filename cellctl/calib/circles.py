@@ -102,7 +102,7 @@ def find_circles(
     plane.
     """
     keys, centres, radii = _checked(expected, search_m, line_m)
-    view = PlaneView(camera, np.asarray(T_camera_plane, dtype=float))
+    view = PlaneView(camera, T_camera_plane)
     picture = _picture(image, before, camera, polarity)
     if not keys:
         return {}
@@ -164,9 +164,16 @@ def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
 def _candidates(picture: Picture, view: PlaneView, wanted: _Wanted) -> Candidates:
     """Where the picture's lines vote for rings: the best few about each expected one."""
     reach = wanted.search_m + RADII[1] * wanted.radii.max() + 4.0 * wanted.line_m
-    low, high = wanted.centres.min(axis=0) - reach, wanted.centres.max(axis=0) + reach
+    seen_low, seen_high = view.extent()
+    low = np.maximum(wanted.centres.min(axis=0) - reach, seen_low)
+    high = np.minimum(wanted.centres.max(axis=0) + reach, seen_high)
     cell_m = float(view.pixel_m(wanted.centres).min())
     flat = flatten(view, picture.values, low, high, cell_m)
+    if wanted.radii.min() < LEAST_RADIUS_PX * flat.cell_m:
+        raise SolveError(
+            f"circles of {1e3 * wanted.radii.min():.1f} mm radius are too small to be found in "
+            f"{high[0] - low[0]:.1f} x {high[1] - low[1]:.1f} m: is search_m or the pose wrong?"
+        )
     near = np.zeros(flat.values.shape, np.uint8)
     for column, row in np.rint(flat.cells(wanted.centres)).astype(int):
         cv2.circle(near, (column, row), int(wanted.search_m / flat.cell_m) + 1, 1, -1)
@@ -291,6 +298,8 @@ def _checked(
         if not _positive(item.radius_m):
             raise BadInput(f"circle {item.key!r}: radius_m must be positive: {item.radius_m!r}")
         centres.append(centre)
+        if line_m > item.radius_m:
+            raise BadInput(f"circle {item.key!r}: line_m is wider than its radius")
     keys = [item.key for item in expected]
     if len(set(keys)) < len(keys):
         raise BadInput("two expected circles carry the same key")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cellctl.calib.camera import CameraModel
 from cellctl.errors import BadInput, SolveError
@@ -27,7 +28,7 @@ class PlaneView:
     SolveError when the camera stands in the plane; BadInput when the pose is not rigid.
     """
 
-    def __init__(self, camera: CameraModel, T_camera_plane: Array) -> None:
+    def __init__(self, camera: CameraModel, T_camera_plane: ArrayLike) -> None:
         self.camera = camera
         self.pose = rigid(T_camera_plane, "T_camera_plane")
         self._back = invert(self.pose)
@@ -67,6 +68,14 @@ class PlaneView:
         down = (self.pixels(places + y) - self.pixels(places - y)) / (2.0 * STEP_M)
         area = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
         return 1.0 / np.sqrt(area)
+
+    def extent(self) -> tuple[Array, Array]:
+        """Corners (2,), (2,) of the rectangle on the plane that holds all that the picture shows;
+        infinite when the picture reaches beyond the plane's horizon."""
+        edge = self.places(_border(self.camera))
+        if not np.isfinite(edge).all():
+            return np.full(2, -np.inf), np.full(2, np.inf)
+        return edge.min(axis=0), edge.max(axis=0)
 
     def inside(self, pixels: Array, margin: float = 0.0) -> Mask:
         """(...): whether pixels (..., 2) lie in the picture, `margin` px off its edge."""
@@ -111,14 +120,17 @@ def flatten(view: PlaneView, image: Array, low: Array, high: Array, cell_m: floa
 
 def _largest_ray(camera: CameraModel) -> float:
     """Tangent of the largest angle off the optical axis within the picture."""
-    w, h = camera.image_size
-    t = np.linspace(0.0, 1.0, 33)
-    edge = np.concatenate(
-        [np.stack([t * (w - 1), np.full_like(t, y)], -1) for y in (0, h - 1)]
-        + [np.stack([np.full_like(t, x), t * (h - 1)], -1) for x in (0, w - 1)]
-    )
-    rays = camera.normalise(edge)
+    rays = camera.normalise(_border(camera))
     known = np.isfinite(rays).all(axis=-1)
     if not known.any():
         raise BadInput("camera: its distortion has no inverse at the picture's edge")
     return float(np.linalg.norm(rays[known], axis=-1).max())
+
+
+def _border(camera: CameraModel) -> Array:
+    """Pixels (n, 2) along the picture's edge."""
+    w, h = camera.image_size
+    t = np.linspace(0.0, 1.0, 33)
+    across = [np.stack([t * (w - 1), np.full_like(t, y)], axis=-1) for y in (0, h - 1)]
+    down = [np.stack([np.full_like(t, x), t * (h - 1)], axis=-1) for x in (0, w - 1)]
+    return np.concatenate(across + down)

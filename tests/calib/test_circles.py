@@ -16,7 +16,7 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.circles import Circle, Expected, find_circles
 from cellctl.calib.printed import Unseen
 from cellctl.errors import BadInput, CellctlError, SolveError
-from cellctl.geometry import Array
+from cellctl.geometry import Array, pose_matrix
 from tests.calib.ink import CR, IR, Block, Light, Ring, Sheet, Stroke, above, noisy
 
 R, LINE = 0.010, 0.0008
@@ -82,15 +82,14 @@ def lettering(low: tuple[float, float], high: tuple[float, float], seed: int = 0
     ids=["cr", "ir"],
 )
 def test_centres_are_where_they_are(camera, distance, pitch, radius, line, limit_s):
-    """72 circles, all 8 mm off: accuracy, predicted sigma, and time (twice what is claimed for
-    an idle machine)."""
+    """72 circles, all 8 mm off: accuracy, predicted sigma, and the processor's time."""
     sheet = Sheet(camera, above(distance))
     places = spots((9, 8), pitch, 0.004)
     image = sheet.picture(rings(places, radius, line))
     expected = wanted(places - (0.006, 0.005), radius)
-    started = time.perf_counter()
+    started = time.process_time()
     found = find(image, expected, sheet, line_m=line, search_m=0.015)
-    took = time.perf_counter() - started
+    took = time.process_time() - started
     off = errors(found, places, sheet)
     assert rms(off) < 0.01
     assert np.abs(off.mean(axis=0)).max() < 0.003
@@ -101,7 +100,7 @@ def test_centres_are_where_they_are(camera, distance, pitch, radius, line, limit
         assert np.allclose(camera.normalise(circle.centre_px), circle.xy)
         assert circle.radius_m == pytest.approx(radius, rel=0.006)
         assert circle.seen > 0.98
-    assert took < 2 * limit_s
+    assert took < limit_s
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 30.0, 140.0])
@@ -325,8 +324,10 @@ BLANK = np.full((480, 640), 190, np.uint8)
         ({"before": BLANK[:-1]}, "before"),
         ({"search_m": 0.0}, "search_m"),
         ({"line_m": float("nan")}, "line_m"),
+        ({"line_m": 0.02}, "wider than its radius"),
         ({"polarity": "grey"}, "polarity"),
         ({"T_camera_plane": np.eye(3)}, "T_camera_plane"),
+        ({"T_camera_plane": "above"}, "T_camera_plane"),
         ({"T_camera_plane": np.full((4, 4), np.nan)}, "T_camera_plane"),
         ({"expected": [Expected("a", (0.0, np.inf), R)]}, "'a'"),
         ({"expected": [Expected("a", (0.0, 0.0, 0.0), R)]}, "'a'"),
@@ -355,6 +356,41 @@ def test_a_plane_that_the_camera_does_not_look_at(height):
         find_circles(BLANK, SMALL, T, wanted(np.zeros((1, 2))), search_m=0.01, line_m=LINE)
 
 
+def test_circles_too_small_to_see():
+    with pytest.raises(SolveError, match="too small to be found"):
+        find(BLANK, wanted(np.zeros((1, 2)), 0.002))
+
+
+def test_at_the_pictures_edge():
+    """A circle that leaves the picture by a fifth is found; one that leaves by half is not."""
+    columns = SMALL.image_size[0]
+    x = np.linspace(0.2, 0.35, 3001)
+    at = np.interp(
+        [columns - 1 - 7.0, columns - 1 - 1.0],
+        SHEET.project(np.stack([x, np.zeros_like(x)], axis=-1))[:, 0],
+        x,
+    )
+    for place, kind in zip(at, (Circle, Unseen), strict=True):
+        places = np.array([[place, 0.0]])
+        found = find(SHEET.picture(rings(places)), wanted(places))
+        assert isinstance(found["c00"], kind)
+
+
+@pytest.mark.parametrize("blur", [0.5, 1.2, 1.8])
+def test_in_and_out_of_focus(blur):
+    sheet = replace(SHEET, blur=blur)
+    places = spots((6, 5), 0.04, 0.003)
+    assert rms(errors(find(sheet.picture(rings(places)), wanted(places - 0.003)), places)) < 0.02
+
+
+def test_a_tilt_that_is_wrong_by_five_degrees():
+    places = spots((6, 5), 0.04, 0.003)
+    image = SHEET.picture(rings(places))
+    wrong = replace(SHEET, T=SHEET.T @ pose_matrix((np.radians(5.0), 0.0, 0.0), np.zeros(3)))
+    found = find(image, wanted(places), wrong)
+    assert rms(errors(found, places)) < 0.05
+
+
 NUMBERS = st.floats(-3.0, 3.0) | st.sampled_from([float("nan"), float("inf"), 1e300, -1e-300])
 
 
@@ -372,8 +408,6 @@ def test_whatever_comes_is_answered_or_refused(image, pose, centres, sizes, pola
     camera = CameraModel(
         np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1.0]]), np.zeros(5), (64, 48)
     )
-    from cellctl.geometry import pose_matrix
-
     radius, search, line = sizes
     expected = [Expected(str(i), centre, radius) for i, centre in enumerate(centres)]
     try:
