@@ -27,18 +27,21 @@ JUDGED = 0.6
 """Share of the line that must carry ink at all."""
 HALF = 0.4
 """With less ink than that, what is there need not be the circle."""
+ARC = 0.5
+"""Share of its ink that a half-drawn circle has in one piece; chance lines have less."""
 RADII = (0.5, 1.5)
 """Circles of that many times the commanded radius are told."""
-RADIUS_STEP_PX, RADIUS_STEP = 1.2, 0.06
+RADIUS_STEP_PX, RADIUS_STEP = 1.0, 0.06
 EACH = 10
 """So many rings at most are looked at for each expected one."""
 WEAKER = 0.35
 """... and none that has less than that share of the best one's votes."""
-ROUND_PX = 0.7
-"""A line that leaves the fitted circle by more, rms, is no circle."""
+ROUND_PX = 0.3
+"""A line that leaves the fitted circle by more, rms, is no circle; noise adds to it. A pen's
+tremor is a tenth of a pixel, and so is the plane's tilt when it is wrong by 10 degrees."""
 SAME_PX = 2.0
 LEAST_RADIUS_PX = 3.0
-COARSE_ANGLES, COARSE_WIDTHS = 36, (1.6, 1.3)
+COARSE_ANGLES, COARSE_WIDTHS = 36, (1.15, 1.0, 1.0)
 SATURATED = 249.0
 LEAST_NOISE = 0.3
 
@@ -99,7 +102,7 @@ def find_circles(
     plane.
     """
     keys, centres, radii = _checked(expected, search_m, line_m)
-    view = PlaneView(camera, np.asarray(T_camera_plane, dtype=float))
+    view = PlaneView(camera, T_camera_plane)
     picture = _picture(image, before, camera, polarity)
     if not keys:
         return {}
@@ -153,16 +156,24 @@ def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
     circumference = 2.0 * np.pi * np.median(wanted.radii) / np.median(view.pixel_m(wanted.centres))
     angles = int(np.clip(circumference, 64, 160))
     fine = fit_rings(picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles)
-    sound = (fine.rms_px < ROUND_PX) & (fine.ink > HALF / 2)
+    allowed = ROUND_PX + picture.noise / np.maximum(fine.depth, picture.noise)
+    sound = (fine.rms_px < allowed) & (fine.ink > HALF / 2)
     return fine[_distinct(fine, view, sound)]
 
 
 def _candidates(picture: Picture, view: PlaneView, wanted: _Wanted) -> Candidates:
     """Where the picture's lines vote for rings: the best few about each expected one."""
     reach = wanted.search_m + RADII[1] * wanted.radii.max() + 4.0 * wanted.line_m
-    low, high = wanted.centres.min(axis=0) - reach, wanted.centres.max(axis=0) + reach
+    seen_low, seen_high = view.extent()
+    low = np.maximum(wanted.centres.min(axis=0) - reach, seen_low)
+    high = np.minimum(wanted.centres.max(axis=0) + reach, seen_high)
     cell_m = float(view.pixel_m(wanted.centres).min())
     flat = flatten(view, picture.values, low, high, cell_m)
+    if wanted.radii.min() < LEAST_RADIUS_PX * flat.cell_m:
+        raise SolveError(
+            f"circles of {1e3 * wanted.radii.min():.1f} mm radius are too small to be found in "
+            f"{high[0] - low[0]:.1f} x {high[1] - low[1]:.1f} m: is search_m or the pose wrong?"
+        )
     near = np.zeros(flat.values.shape, np.uint8)
     for column, row in np.rint(flat.cells(wanted.centres)).astype(int):
         cv2.circle(near, (column, row), int(wanted.search_m / flat.cell_m) + 1, 1, -1)
@@ -212,8 +223,8 @@ def _answer(rings: Rings, number: int, view: PlaneView) -> Circle | Unseen:
     if not _whole(rings)[number]:
         if ink + hidden >= WHOLE and hidden > 0.15:
             return Unseen(f"glare or print hides {100 * hidden:.0f} % of its line")
-        if ink < HALF:
-            return Unseen(f"{NO_INK}, but for lines along {100 * ink:.0f} % of one")
+        if ink < HALF or rings.arc[number] < ARC * rings.complete[number]:
+            return Unseen(f"{NO_INK}, but for pieces of lines along {100 * ink:.0f} % of one")
         return Unseen(f"half drawn: ink on {100 * rings.complete[number]:.0f} % of its line")
     place = rings.centres[number]
     centre_px = view.pixels(place)
@@ -287,6 +298,8 @@ def _checked(
         if not _positive(item.radius_m):
             raise BadInput(f"circle {item.key!r}: radius_m must be positive: {item.radius_m!r}")
         centres.append(centre)
+        if line_m > item.radius_m:
+            raise BadInput(f"circle {item.key!r}: line_m is wider than its radius")
     keys = [item.key for item in expected]
     if len(set(keys)) < len(keys):
         raise BadInput("two expected circles carry the same key")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cellctl.calib.camera import CameraModel
 from cellctl.errors import BadInput, SolveError
@@ -14,7 +15,7 @@ from cellctl.geometry import Array, Mask, invert, rigid, transform_points
 NODES = 8
 """A flat picture is interpolated between exact places every so many cells: a lens bends the
 picture over that length by 0.002 px."""
-MOST_CELLS = 6_000_000
+MOST_CELLS, LONGEST = 6_000_000, 16_000
 RIM = 1.05
 """Rays further off the axis than the picture's by that factor have no picture: there a
 distortion polynomial may fold back into it."""
@@ -27,7 +28,7 @@ class PlaneView:
     SolveError when the camera stands in the plane; BadInput when the pose is not rigid.
     """
 
-    def __init__(self, camera: CameraModel, T_camera_plane: Array) -> None:
+    def __init__(self, camera: CameraModel, T_camera_plane: ArrayLike) -> None:
         self.camera = camera
         self.pose = rigid(T_camera_plane, "T_camera_plane")
         self._back = invert(self.pose)
@@ -68,11 +69,20 @@ class PlaneView:
         area = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
         return 1.0 / np.sqrt(area)
 
+    def extent(self) -> tuple[Array, Array]:
+        """Corners (2,), (2,) of the rectangle on the plane that holds all that the picture shows;
+        infinite when the picture reaches beyond the plane's horizon."""
+        edge = self.places(_border(self.camera))
+        if not np.isfinite(edge).all():
+            return np.full(2, -np.inf), np.full(2, np.inf)
+        return edge.min(axis=0), edge.max(axis=0)
+
     def inside(self, pixels: Array, margin: float = 0.0) -> Mask:
         """(...): whether pixels (..., 2) lie in the picture, `margin` px off its edge."""
         size = np.array(self.camera.image_size)
         with np.errstate(invalid="ignore"):
-            return ((pixels >= margin) & (pixels <= size - 1 - margin)).all(axis=-1)
+            within = (pixels >= margin) & (pixels <= size - 1 - margin)
+        return np.asarray(within.all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +103,8 @@ class Flat:
 def flatten(view: PlaneView, image: Array, low: Array, high: Array, cell_m: float) -> Flat:
     """The part of `image` (h, w) that shows the rectangle from `low` to `high`, (2,) metres on
     the plane. Cells grow where the rectangle would have more than MOST_CELLS of them."""
-    cell_m = max(cell_m, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
+    least = max(np.sqrt(np.prod(high - low) / MOST_CELLS), (high - low).max() / LONGEST)
+    cell_m = max(cell_m, float(least))
     columns, rows = np.ceil((high - low) / cell_m / NODES).astype(int) + 1
     x = low[0] + cell_m * (NODES * np.arange(-1, columns + 1) + (NODES - 1) / 2)
     y = low[1] + cell_m * (NODES * np.arange(-1, rows + 1) + (NODES - 1) / 2)
@@ -101,21 +112,25 @@ def flatten(view: PlaneView, image: Array, low: Array, high: Array, cell_m: floa
     size = ((columns + 2) * NODES, (rows + 2) * NODES)
     pixels = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)[NODES:-NODES, NODES:-NODES]
     seen = view.inside(pixels)
-    pixels = np.where(seen[..., None], pixels, np.float32(-1.0))
-    values = cv2.remap(image, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pixels = np.where(seen[..., None], pixels, -1.0)
+    x_map, y_map = (np.ascontiguousarray(pixels[..., i], dtype=np.float32) for i in (0, 1))
+    values = cv2.remap(image, x_map, y_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return Flat(np.asarray(values, dtype=np.float32), seen, low.astype(float), cell_m)
 
 
 def _largest_ray(camera: CameraModel) -> float:
     """Tangent of the largest angle off the optical axis within the picture."""
-    w, h = camera.image_size
-    t = np.linspace(0.0, 1.0, 33)
-    edge = np.concatenate(
-        [np.stack([t * (w - 1), np.full_like(t, y)], -1) for y in (0, h - 1)]
-        + [np.stack([np.full_like(t, x), t * (h - 1)], -1) for x in (0, w - 1)]
-    )
-    rays = camera.normalise(edge)
+    rays = camera.normalise(_border(camera))
     known = np.isfinite(rays).all(axis=-1)
     if not known.any():
         raise BadInput("camera: its distortion has no inverse at the picture's edge")
     return float(np.linalg.norm(rays[known], axis=-1).max())
+
+
+def _border(camera: CameraModel) -> Array:
+    """Pixels (n, 2) along the picture's edge."""
+    w, h = camera.image_size
+    t = np.linspace(0.0, 1.0, 33)
+    across = [np.stack([t * (w - 1), np.full_like(t, y)], axis=-1) for y in (0, h - 1)]
+    down = [np.stack([np.full_like(t, x), t * (h - 1)], axis=-1) for x in (0, w - 1)]
+    return np.concatenate(across + down)

@@ -19,7 +19,11 @@ from cellctl.geometry import Array, Mask
 BLUR_PX = 0.75
 """What a lens and a pixel's own width add to a line, standard deviation."""
 STEP_PX = 0.5
-REACH = 3.2
+SIDE = 1.7
+"""The line's sides begin that many standard deviations off it."""
+DIP = 0.3
+"""A line is darker than both of its sides by that share of its depth."""
+REACH = 2.6
 """Half the length of a profile, in standard deviations of the line."""
 CLEAR = 4.0
 """Ink is darker than its sides by so many times the noise ..."""
@@ -27,8 +31,9 @@ PALE = 0.35
 """ ... and by that share of the line's median depth."""
 OFF_PX = 1.0
 """Ink that far off the fitted circle is not the circle's line."""
-WIDTHS = (1.6, 1.3, 1.0, 1.0, 1.0, 1.0)
-"""From wide profiles, which find the line from afar, to those as wide as the line."""
+WIDTHS = (1.0,) * 5
+"""Of the profiles of each round, in those of the line; wider ones find it from further away, but
+run into neighbours."""
 TUKEY = 4.7
 LEAST_SCALE_PX = 0.04
 CORRELATED_PX = 1.5
@@ -49,13 +54,15 @@ class Picture:
 class Rings:
     """Fitted rings side by side: `centres` (n, 2) and `radii` (n,) in metres on the plane;
     `ink`, `hidden` (n,), shares of the circumference with ink, and that cannot be judged;
-    `depth` (n,), the line's median depth in grey levels; `rms_px`, `sigma_px` (n,), of the
+    `arc` (n,), share of the longest piece without a gap; `depth` (n,), the line's median depth
+    in grey levels; `rms_px`, `sigma_px` (n,), of the
     line's points about the circle, and one standard deviation of the centre per axis."""
 
     centres: Array
     radii: Array
     ink: Array
     hidden: Array
+    arc: Array
     depth: Array
     rms_px: Array
     sigma_px: Array
@@ -75,10 +82,12 @@ class Rings:
 @dataclass(frozen=True, eq=False)
 class _Profiles:
     """Lines across each ring (n, k): `off` px outward of the circle, `depth` in grey levels,
-    `centre`, the grey level on the circle, `sides`, that of the paper beside it, `blind`."""
+    `dip`, by how much the line is darker than the darker one of its sides, `centre`, the grey
+    level on the circle, `sides`, that of the paper beside it, `blind`."""
 
     off: Array
     depth: Array
+    dip: Array
     centre: Array
     sides: Array
     blind: Mask
@@ -95,6 +104,8 @@ def fit_rings(
     widths: tuple[float, ...] = WIDTHS,
 ) -> Rings:
     """Rings fitted from starts `centres` (n, 2), `radii` (n,), right to about two pixels."""
+    if not len(radii):
+        return Rings(centres, *np.zeros((7, 0)))
     theta = 2.0 * np.pi * np.arange(angles) / angles
     spokes = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     design = np.column_stack([spokes, np.ones(angles)])
@@ -126,7 +137,7 @@ def _profiles(
     outward = pixel_m[:, None, None, None] * t[[0, count, -1], None] * spokes[:, None]
     ends = view.pixels(on_line[:, :, None] + outward)
     pixels = _parabolas(t / t[-1]) @ ends
-    unseen = ~view.inside(ends, 1.0).all(axis=-1)
+    unseen = np.asarray(~view.inside(ends, 1.0).all(axis=-1))
     pixels = np.nan_to_num(pixels)
     values = np.asarray(sample(picture.values, pixels), dtype=float)
     level, _, depth, shift = np.moveaxis(values @ _bell_solver(t, middle).T, -1, 0)
@@ -134,7 +145,17 @@ def _profiles(
         off = np.where(depth > 0, shift / depth, np.nan)
     if picture.blind is not None:
         unseen |= sample(picture.blind, pixels[:, :, count]) > 0.25
-    return _Profiles(off, depth, values[..., count], level, unseen)
+    dip = _dip(values, np.abs(t) <= OFF_PX, np.abs(t) >= SIDE * middle)
+    return _Profiles(off, depth, dip, values[..., count], level, unseen)
+
+
+def _dip(values: Array, on_line: Mask, beside: Mask) -> Array:
+    """(n, k): how far profiles (n, k, t) go down within the line from their darker end. A
+    shoulder of something bright, or a step, goes down on one side only."""
+    half = values.shape[-1] // 2
+    inner, outer = values[..., :half][..., beside[:half]], values[..., -half:][..., beside[-half:]]
+    lowest = values[..., on_line].min(axis=-1)
+    return np.minimum(inner.mean(axis=-1), outer.mean(axis=-1)) - lowest
 
 
 def _parabolas(u: Array) -> Array:
@@ -153,7 +174,7 @@ def _bell_solver(t: Array, sigma: float) -> Array:
 def _inked(profiles: _Profiles, noise: float, off_px: float) -> Mask:
     """(n, k): where the ring has its line."""
     depth = np.where(profiles.blind, 0.0, profiles.depth)
-    clear = depth > CLEAR * noise
+    clear = (depth > CLEAR * noise) & (profiles.dip > DIP * depth)
     usual = _median(np.where(clear, depth, np.nan))
     deep = depth > PALE * np.nan_to_num(usual, nan=np.inf)[:, None]
     with np.errstate(invalid="ignore"):
@@ -210,11 +231,13 @@ def _measured(
     spacing = 2.0 * np.pi * radii / pixel_m / len(design)
     alike = np.maximum(CORRELATED_PX / spacing, 1.0)  # neighbours that share their noise
     depth = np.nan_to_num(_median(np.where(used, profiles.depth, np.nan)))
+    hidden = _hidden(profiles, inked, depth)
     return Rings(
         centres=centres,
         radii=radii,
         ink=inked.mean(axis=1),
-        hidden=_hidden(profiles, inked, depth).mean(axis=1),
+        hidden=hidden.mean(axis=1),
+        arc=_longest(inked | hidden),
         depth=depth,
         rms_px=rms,
         sigma_px=rms * np.sqrt(spread * alike),
@@ -227,3 +250,11 @@ def _hidden(profiles: _Profiles, inked: Mask, depth: Array) -> Mask:
     paper = _median(np.where(inked, profiles.sides, np.nan))
     dark = profiles.centre < (paper - 0.5 * depth)[:, None]
     return ~inked & (profiles.blind | dark)
+
+
+def _longest(line: Mask) -> Array:
+    """(n,): share of each circle (n, k) that its longest piece without a gap takes."""
+    twice = np.concatenate([line, line], axis=1)
+    number = np.arange(twice.shape[1])
+    last_gap = np.maximum.accumulate(np.where(twice, -1, number), axis=1)
+    return np.minimum((number - last_gap).max(axis=1) / line.shape[1], 1.0)

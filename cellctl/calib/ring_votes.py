@@ -6,6 +6,7 @@ D. Ballard and J. Sklansky, Finding circles by an array of accumulators, 1975).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -121,7 +122,7 @@ def _peaks(lines: Lines, flat: Flat, radius: float, wanted: Mask) -> Candidates:
     flat_index = targets[inside, 1] * w + targets[inside, 0]
     counts = np.bincount(flat_index, minlength=h * w).reshape(h, w).astype(np.float32)
     whole = radius / flat.cell_m / (BLUR_OF_VOTES**2 + SCATTER**2)  # 2 pi r / (2 pi sigma^2)
-    share = cv2.GaussianBlur(counts, (0, 0), BLUR_OF_VOTES) / whole
+    share: Any = cv2.GaussianBlur(counts, (0, 0), BLUR_OF_VOTES) / whole
     top = (share >= cv2.dilate(share, np.ones((5, 5), np.uint8))) & (share > LEAST_SHARE) & wanted
     rows, columns = np.nonzero(top)
     centres = flat.origin + np.stack([columns, rows], axis=-1) * flat.cell_m

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
-from cellctl.geometry import Array, look_down, invert
+from cellctl.geometry import Array, invert, look_down
 
 PAPER = 190.0
 SUPERSAMPLE = 6
@@ -110,6 +110,13 @@ class Light:
     radius: float = 0.05
 
 
+def noisy(clean: Any, seed: int, noise: float = 1.0) -> Any:
+    """(h, w) uint8: what the sensor makes of (h, w) float32."""
+    rng = np.random.default_rng(seed)
+    lit = clean + np.float32(noise) * rng.standard_normal(clean.shape, dtype=np.float32)
+    return np.clip(np.rint(lit), 0, 255).astype(np.uint8)
+
+
 def _edge(signed: Array, cell: float) -> Array:
     return np.clip(0.5 - signed / cell, 0.0, 1.0)
 
@@ -126,15 +133,16 @@ class Sheet:
 
     def picture(self, things: Any, *, noise: float = 1.0, seed: int = 0) -> Any:
         """(h, w) uint8; `noise` is that of the mean of several pictures."""
+        return noisy(self.clean(things), seed, noise)
+
+    def clean(self, things: Any) -> Any:
+        """(h, w) float32 without noise."""
         w, h = self.camera.image_size
         reflected = np.ones((h, w), np.float32)
         added = np.zeros((h, w), np.float32)
         for thing in things:
             self._draw(thing, reflected, added)
-        lit = self._lit(reflected, added)
-        rng = np.random.default_rng(seed)
-        lit += np.float32(noise) * rng.standard_normal(lit.shape, dtype=np.float32)
-        return np.clip(np.rint(lit), 0, 255).astype(np.uint8)
+        return self._lit(reflected, added)
 
     def project(self, places: Array) -> Array:
         places = np.asarray(places, dtype=float)
