@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -77,13 +76,15 @@ FAMILIES = (
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Marks as arrays: `xy` (n, 2) m, `turn` (n, 2, 2) = R(yaw) - R(0), `seen` (n, 2), and
+    """Marks as arrays: `xy` (n, 2) m, `turn` (n, 2, 2) = R(yaw) - R(0), `seen` (n, 2), `mm`
+    (n, 2, 2), millimetres on the table by a unit of the camera's plane, at the circles; and
     `table` (3, 3), the homography from world (x, y) in metres to camera coordinates."""
 
     keys: tuple[str, ...]
     xy: Array
     turn: Array
     seen: Array
+    mm: Array
     table: Array
 
     @classmethod
@@ -99,14 +100,17 @@ class Marks:
         yaw = np.array([mark.yaw for mark in marks], dtype=float)
         xy = np.array([mark.xy for mark in marks], dtype=float).reshape(-1, 2)
         seen = np.array([mark.seen for mark in marks], dtype=float).reshape(-1, 2)
-        return cls(keys, xy, rotations(yaw) - np.eye(2), seen, base.table_homography)
+        table = base.table_homography
+        mm = 1e3 * homography_slopes(np.linalg.inv(table), seen)
+        return cls(keys, xy, rotations(yaw) - np.eye(2), seen, mm, table)
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def __getitem__(self, index: Any) -> Marks:
         keys = tuple(np.array(self.keys, dtype=object)[index])
-        return Marks(keys, self.xy[index], self.turn[index], self.seen[index], self.table)
+        xy, turn, seen, mm = self.xy, self.turn, self.seen, self.mm
+        return Marks(keys, xy[index], turn[index], seen[index], mm[index], self.table)
 
     def stand(self, tcp: Array) -> Array:
         """World places (n, 2), metres, of a pen that is off by tcp (2,) metres."""
@@ -119,12 +123,6 @@ class Marks:
     def on_table_mm(self, xy: Array) -> Array:
         """World (x, y) in millimetres of camera coordinates (n, 2)."""
         return 1e3 * apply_homography(np.linalg.inv(self.table), xy)
-
-    @cached_property
-    def mm(self) -> Array:
-        """(n, 2, 2): millimetres on the table by a unit of the camera's plane, at the circles."""
-        places = apply_homography(np.linalg.inv(self.table), self.seen)
-        return 1e3 * np.linalg.inv(homography_slopes(self.table, places))
 
 
 def rotations(yaw: Array) -> Array:
@@ -155,7 +153,7 @@ class Fit:
     """A refinement with the pen's offset `tcp` (2,), metres, that goes with it.
 
     `normal` is A^T A + diag(penalty) in square millimetres with A (2n, p + 2), tcp in mm coming
-    last; `count` is n.
+    last; `count` is n; `smooth` the radial functions, where there are any.
     """
 
     refinement: Refinement
@@ -163,6 +161,7 @@ class Fit:
     normal: Array
     penalty: Array
     count: int
+    smooth: Smoother | None = None
 
     @property
     def freedom(self) -> float:
@@ -208,7 +207,7 @@ def fit(
         values, tcp = values + step[:-2], tcp + 1e-3 * step[-2:]
         if np.abs(step).max() < NEGLIGIBLE_STEP:
             break
-    return Fit(parameters.refinement(values), tcp, normal, penalty, len(marks))
+    return Fit(parameters.refinement(values), tcp, normal, penalty, len(marks), smooth)
 
 
 def condition(family: Family, marks: Marks, frame: Frame) -> float:
@@ -232,14 +231,10 @@ def _plain(family: Family) -> Family:
     return replace(family, name="affine", kernel="none")
 
 
-def _smoother(
-    kernel: str, plain: Fit, marks: Marks, frame: Frame, start: Fit | None
-) -> Smoother | None:
-    """None when what the affine fit leaves calls for no smooth part that could be told from it."""
+def _smoother(kernel: str, plain: Fit, marks: Marks, frame: Frame, start: Fit | None) -> Smoother:
     u = plain.refinement.scaled(marks.chain(plain.tcp))
     left = (marks.seen - plain.predict(marks)) / frame.scale
-    length = start.refinement.length if start is not None else None
-    return smoother(kernel, u, left, length)
+    return smoother(kernel, u, left, None if start is None else start.smooth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,15 +265,12 @@ class _Parameters:
         of_H, count = self.family.entries.shape[1], 2 * self.family.monomials
         H = np.eye(3) + np.append(self.family.entries @ values[:of_H], 0.0).reshape(3, 3)
         polynomial = values[of_H : of_H + count].reshape(-1, 2)
-        plain = Refinement(self.family.name, self.frame.centre, self.frame.scale, H, polynomial)
+        plain = (self.family.name, self.frame.centre, self.frame.scale, H, polynomial)
         if self.smooth is None:
-            return plain
-        return replace(
-            plain,
-            kernel=self.smooth.kernel,
-            length=self.smooth.length,
-            nodes=self.smooth.nodes,
-            weights=self.smooth.weights @ values[of_H + count :].reshape(-1, 2),
+            return Refinement(*plain)
+        weights = self.smooth.weights @ values[of_H + count :].reshape(-1, 2)
+        return Refinement(
+            *plain, self.smooth.kernel, self.smooth.length, self.smooth.nodes, weights
         )
 
     def basis(self, at: Refinement, u: Array) -> Array:

@@ -111,7 +111,7 @@ def test_the_result_says_what_it_rests_on(cell, whole):
 
 def test_more_freedom_is_not_taken_without_need(cell):
     """Where the truth is a similarity, the richer families fit better and are not chosen."""
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         drawn = synthetic(cell, correction("similarity"), np.zeros(2))
         noisy = [replace(m, seen=m.seen + rng.normal(0, 2e-4, 2)) for m in drawn]
@@ -190,11 +190,11 @@ def test_the_covariance_is_that_of_repeated_solves(cell):
     xy = layout(cell.truth, np.random.default_rng(0))
     found = [
         solve_refine(cell.marks(xy, np.random.default_rng(i)), cell.base, families=["affine"])
-        for i in range(30)
+        for i in range(20)
     ]
     scatter = np.std([r.tcp_mm for r in found], axis=0, ddof=1)
     stated = np.sqrt(np.mean([r.tcp_covariance_mm2.diagonal() for r in found], axis=0))
-    assert np.all(np.abs(np.log(scatter / stated)) < 0.4)
+    assert np.all(np.abs(np.log(scatter / stated)) < 0.5)
 
 
 def test_the_order_of_the_circles_does_not_matter(cell, marks):
