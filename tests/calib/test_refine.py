@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from cellctl.calib.refine import rows, solve_refine
-from cellctl.calib.refine_fit import FAMILIES, LARGEST_CONDITION, Frame, Mark, Marks, condition
+from cellctl.calib.refine_fit import (
+    FAMILIES,
+    LARGEST_CONDITION,
+    Frame,
+    Mark,
+    Marks,
+    condition,
+    fit,
+    held_out_fits,
+)
 from cellctl.calib.refine_result import RefineResult
 from cellctl.calib.refinement import Refinement
 from cellctl.errors import BadInput, SolveError
@@ -132,6 +141,29 @@ def test_a_cubic_on_a_grid_is_refused_though_held_out_errors_like_it(cell):
     jittered = Marks.of(cell.marks(layout(cell.truth, rng), rng), cell.base)
     cubic = FAMILIES[-1]
     assert condition(cubic, jittered, Frame.of(jittered)) < LARGEST_CONDITION / 2
+
+
+@pytest.mark.parametrize("family", [f for f in FAMILIES if f.kernel == "none"])
+def test_one_step_without_a_circle_is_the_whole_way(cell, marks, family):
+    drawn = Marks.of(marks, cell.base)
+    frame = Frame.of(drawn)
+    fold = np.arange(len(drawn)) % 7
+    for number, rest in held_out_fits(family, drawn, frame, fit(family, drawn, frame), fold):
+        afresh = fit(family, drawn[fold != number], frame)
+        off = drawn.on_table_mm(rest.predict(drawn)) - drawn.on_table_mm(afresh.predict(drawn))
+        assert np.abs(off).max() < 1e-3
+        assert rest.freedom == pytest.approx(afresh.freedom, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 24])
+@pytest.mark.parametrize("line", [(1.0, 0.0), (0.0, 1.0), (1.0, 0.5), (0.0, 0.0)])
+def test_circles_on_a_line_or_a_spot_determine_no_more_than_they_do(cell, count, line):
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-0.15, 0.15, (count, 1)) * np.array(line)
+    xy = cell.truth.preset.table.centre_m[:2] + along
+    result = solve_refine(cell.marks(xy, rng), cell.base, families=[*PLAIN, "cubic"])
+    assert result.chosen in ("none", "shift", "similarity")
+    assert np.isfinite(result.errors_mm).all()
 
 
 def test_rows_and_columns_are_left_out_whole():
