@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cellctl.calib.adjust import joint_family
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.refine_fit import (
     FAMILIES,
@@ -26,6 +27,8 @@ from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
 
 MINIMUM_MARKS = 4
+JOINT_PLACE = 3
+"""Among the families in order of preference: after the similarity."""
 BANDS = 5
 """In which the marks' x, and their y, are cut: rows of a grid of up to five stay whole."""
 UNDETERMINED = 1e3
@@ -36,7 +39,11 @@ LARGEST_REJECTED = 0.4
 
 
 def solve_refine(
-    marks: Sequence[Mark], base: Calibration, *, families: Sequence[str] | None = None
+    marks: Sequence[Mark],
+    base: Calibration,
+    *,
+    pose_covariance: Array | None = None,
+    families: Sequence[str] | None = None,
 ) -> RefineResult:
     """The correction of `base` (whose own refinement is ignored) that predicts unseen circles
     best, and the pen's offset.
@@ -44,8 +51,9 @@ def solve_refine(
     Each family is judged by the worse of two held-out errors, everything being fitted again:
     without one circle, and without one row or column of them. The first that cannot be told from
     the best is taken. Circles that contradict the others are left out of every fit and still get
-    a held-out error. `families`: only these are tried. SolveError when fewer than 4 circles agree;
-    BadInput as `Marks.of`.
+    a held-out error. `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult,
+    allows the joint adjustment. `families`: only these are tried. SolveError when fewer than 4
+    circles agree; BadInput as `Marks.of`.
     """
     base = replace(base, refinement=None)
     marks = sorted(marks, key=lambda mark: mark.key)
@@ -54,7 +62,11 @@ def solve_refine(
         raise SolveError(f"only {len(drawn)} circles were measured, {MINIMUM_MARKS} are needed")
     frame = Frame.of(drawn)
     used = _consensus(drawn, frame)
-    wanted = [f for f in FAMILIES if families is None or f.name in families]
+    known = list(FAMILIES)
+    if pose_covariance is not None:
+        joint = joint_family(base, pose_covariance, drawn, frame)
+        known.insert(JOINT_PLACE, joint)
+    wanted = [f for f in known if families is None or f.name in families]
     tried = [_candidate(family, drawn, used, frame, base) for family in wanted]
     chosen, why = choose([c for c in tried if c.fit is not None])
     assert chosen.fit is not None
@@ -68,6 +80,8 @@ def solve_refine(
         candidates=tuple(tried),
         keys=drawn.keys,
         errors_mm=errors,
+        errors_px=base.projector.project(chosen.fit.predict(drawn))
+        - base.projector.project(drawn.seen),
         used=used,
         rejected=tuple(
             Rejection(

@@ -43,13 +43,15 @@ class Mark:
 @dataclass(frozen=True, eq=False)
 class Family:
     """`entries` (8, p): how the parameters move H's first eight entries about the identity.
-    `monomials` counts those of higher degree. Allowed from `least` marks."""
+    `monomials` counts those of higher degree. Allowed from `least` marks. `known`: the parameters
+    are in standard deviations of what was known of them before."""
 
     name: str
     least: int
     entries: Array
     monomials: int = 0
     kernel: str = "none"
+    known: bool = False
 
 
 def _entries(*columns: dict[int, float]) -> Array:
@@ -243,8 +245,8 @@ def condition(family: Family, marks: Marks, frame: Frame) -> float:
     start = Refinement(family.name, frame.centre, frame.scale)
     columns = _Parameters(family, frame, None).basis(start, start.scaled(marks.chain(np.zeros(2))))
     columns = columns.reshape(2 * len(marks), -1)
-    if columns.shape[1] == 0:
-        return 1.0
+    if columns.shape[1] == 0 or family.known:
+        return 1.0  # nothing to determine, or determined before
     lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     singular = np.linalg.svd(columns / lengths, compute_uv=False)
     short = len(singular) < columns.shape[1]
@@ -314,6 +316,8 @@ class _Parameters:
         if self.smooth is not None:
             ridge = 2 * self.smooth.weights.shape[1]
             diagonal[-2 - ridge : -2] = self.smooth.ridge * self.frame.mm**2
+        if self.family.known:
+            diagonal[: self.family.entries.shape[1]] = MARK_SIGMA_MM**2
         diagonal[-2:] = (MARK_SIGMA_MM / TCP_PRIOR_MM) ** 2
         return diagonal, diagonal * np.append(values, 1e3 * tcp)
 

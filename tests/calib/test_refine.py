@@ -115,6 +115,7 @@ def test_the_result_says_what_it_rests_on(cell, whole):
         )
     document = json.loads(json.dumps(whole.to_dict(), allow_nan=False))
     assert Refinement.from_dict(document["refinement"]).to_dict() == whole.refinement.to_dict()
+    assert document["per_circle"]["circle-007"]["px"] == whole.errors_px[7].tolist()
     assert document["candidates"]["cubic"]["allowed"] is True
 
 
