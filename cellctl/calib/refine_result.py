@@ -101,10 +101,10 @@ def _by_circle(errors: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class RefineResult:
     """`tcp_mm` (2,): how far the pen stands from where its tip is believed, in world axes at the
-    drawing posture, with its covariance. `errors_mm` (n, 2) and `errors_px` are the fit's errors of all
-    circles, predicted minus seen, on the table and in the projector; `used` (n,) those that it
-    rests on. `mark_sigma_mm`: noise of a mark per
-    axis, known with `mark_freedom` degrees of freedom."""
+    drawing posture, with its covariance. `errors_mm` (n, 2) and `errors_px` are the fit's errors
+    of all circles, predicted minus seen, on the table and in the projector; `used` (n,) those
+    that it rests on. `mark_sigma_mm`: noise of a mark per axis, known with `mark_freedom` degrees
+    of freedom."""
 
     refinement: Refinement
     tcp_mm: Array
