@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cellctl.calib.adjust import joint_family
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.refine_fit import (
     FAMILIES,
@@ -18,6 +19,7 @@ from cellctl.calib.refine_fit import (
     Marks,
     condition,
     fit,
+    held_out_fits,
 )
 from cellctl.calib.refine_result import Candidate, RefineResult
 from cellctl.calib.views import Rejection, excess
@@ -25,15 +27,23 @@ from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
 
 MINIMUM_MARKS = 4
+JOINT_PLACE = 3
+"""Among the families in order of preference: after the similarity."""
 BANDS = 5
 """In which the marks' x, and their y, are cut: rows of a grid of up to five stay whole."""
+UNDETERMINED = 1e3
+"""A condition number."""
 HUBER_MM = 0.4
 OUTLIER_SIGMAS, OUTLIER_FLOOR_MM = 5.0, 0.6
 LARGEST_REJECTED = 0.4
 
 
 def solve_refine(
-    marks: Sequence[Mark], base: Calibration, *, families: Sequence[str] | None = None
+    marks: Sequence[Mark],
+    base: Calibration,
+    *,
+    pose_covariance: Array | None = None,
+    families: Sequence[str] | None = None,
 ) -> RefineResult:
     """The correction of `base` (whose own refinement is ignored) that predicts unseen circles
     best, and the pen's offset.
@@ -41,8 +51,9 @@ def solve_refine(
     Each family is judged by the worse of two held-out errors, everything being fitted again:
     without one circle, and without one row or column of them. The first that cannot be told from
     the best is taken. Circles that contradict the others are left out of every fit and still get
-    a held-out error. `families`: only these are tried. SolveError when fewer than 4 circles agree;
-    BadInput as `Marks.of`.
+    a held-out error. `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult,
+    allows the joint adjustment. `families`: only these are tried. SolveError when fewer than 4
+    circles agree; BadInput as `Marks.of`.
     """
     base = replace(base, refinement=None)
     marks = sorted(marks, key=lambda mark: mark.key)
@@ -51,7 +62,11 @@ def solve_refine(
         raise SolveError(f"only {len(drawn)} circles were measured, {MINIMUM_MARKS} are needed")
     frame = Frame.of(drawn)
     used = _consensus(drawn, frame)
-    wanted = [f for f in FAMILIES if families is None or f.name in families]
+    known = list(FAMILIES)
+    if pose_covariance is not None:
+        joint = joint_family(base, pose_covariance, drawn, frame)
+        known.insert(JOINT_PLACE, joint)
+    wanted = [f for f in known if families is None or f.name in families]
     tried = [_candidate(family, drawn, used, frame, base) for family in wanted]
     chosen, why = choose([c for c in tried if c.fit is not None])
     assert chosen.fit is not None
@@ -65,6 +80,8 @@ def solve_refine(
         candidates=tuple(tried),
         keys=drawn.keys,
         errors_mm=errors,
+        errors_px=base.projector.project(chosen.fit.predict(drawn))
+        - base.projector.project(drawn.seen),
         used=used,
         rejected=tuple(
             Rejection(
@@ -94,26 +111,31 @@ def _candidate(
     family: Family, marks: Marks, used: Mask, frame: Frame, base: Calibration
 ) -> Candidate:
     good = marks[used]
-    number = condition(family, good, frame)
+    number, ways = condition(family, good, frame), rows(good.xy)
     if len(good) < family.least:
         return Candidate(family.name, number, f"needs {family.least} circles, not {len(good)}")
     if number > LARGEST_CONDITION:
         why = f"the circles' places cannot determine it: condition number {number:.3g}"
         return Candidate(family.name, number, why)
+    rests = [good[way != band] for way in ways for band in np.unique(way)]
+    if max(condition(family, rest, frame) for rest in rests) > UNDETERMINED:
+        why = "the circles' places do not determine it when a row of them is left out"
+        return Candidate(family.name, number, why)
     found = fit(family, good, frame)
     predicted = {
         name: _held_out(family, marks, used, frame, found, folds)
-        for name, folds in (("one", np.arange(len(good))[None]), ("row", rows(good.xy)))
+        for name, folds in (("one", np.arange(len(good))[None]), ("row", ways))
     }
     return Candidate.measured(family.name, number, found, predicted, marks, used, base)
 
 
 def rows(xy: Array) -> Array:
     """Bands (2, n) that marks at xy (n, 2) belong to: of x, and of y. Of equal width, so that a
-    row of a regular layout is left out whole."""
+    row of a regular layout is left out whole. Where all lie in one band, each mark is its own."""
     low, high = xy.min(axis=0), xy.max(axis=0)
     cell = (xy - low) / np.maximum(high - low, 1e-9) * BANDS
-    return np.minimum(cell, BANDS - 1).astype(int).T
+    bands = np.minimum(cell, BANDS - 1).astype(int).T
+    return np.stack([way if np.ptp(way) else np.arange(len(xy)) for way in bands])
 
 
 def _held_out(
@@ -122,11 +144,10 @@ def _held_out(
     """Predicted camera coordinates (n, 2, s) of all marks, each by fits without it; folds (s, n')
     number the folds of used marks in s ways. Marks not used are predicted by the whole fit."""
     predicted = np.repeat(found.predict(marks)[..., None], len(folds), axis=2)
-    indices = np.flatnonzero(used)
+    indices, good = np.flatnonzero(used), marks[used]
     for way, fold in enumerate(folds):
-        for number in np.unique(fold):
+        for number, rest in held_out_fits(family, good, frame, found, fold):
             out = indices[fold == number]
-            rest = fit(family, marks[indices[fold != number]], frame, start=found)
             predicted[out, :, way] = rest.predict(marks[out])
     return predicted
 
@@ -135,7 +156,7 @@ def _consensus(marks: Marks, frame: Frame) -> Mask:
     """Which marks (n,) agree with what most of them say: robustly fitted, Huber's weights."""
     count = len(marks)
     family = max(
-        (f for f in FAMILIES[:5] if f.least <= count and condition(f, marks, frame) < 1e3),
+        (f for f in FAMILIES[:5] if f.least <= count and condition(f, marks, frame) < UNDETERMINED),
         key=lambda f: f.least,
     )
     weights, found = np.ones(count), None

@@ -9,9 +9,8 @@ compared with where the camera saw the circle's centre.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -44,13 +43,15 @@ class Mark:
 @dataclass(frozen=True, eq=False)
 class Family:
     """`entries` (8, p): how the parameters move H's first eight entries about the identity.
-    `monomials` counts those of higher degree. Allowed from `least` marks."""
+    `monomials` counts those of higher degree. Allowed from `least` marks. `known`: the parameters
+    are in standard deviations of what was known of them before."""
 
     name: str
     least: int
     entries: Array
     monomials: int = 0
     kernel: str = "none"
+    known: bool = False
 
 
 def _entries(*columns: dict[int, float]) -> Array:
@@ -77,13 +78,15 @@ FAMILIES = (
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Marks as arrays: `xy` (n, 2) m, `turn` (n, 2, 2) = R(yaw) - R(0), `seen` (n, 2), and
+    """Marks as arrays: `xy` (n, 2) m, `turn` (n, 2, 2) = R(yaw) - R(0), `seen` (n, 2), `mm`
+    (n, 2, 2), millimetres on the table by a unit of the camera's plane, at the circles; and
     `table` (3, 3), the homography from world (x, y) in metres to camera coordinates."""
 
     keys: tuple[str, ...]
     xy: Array
     turn: Array
     seen: Array
+    mm: Array
     table: Array
 
     @classmethod
@@ -99,14 +102,17 @@ class Marks:
         yaw = np.array([mark.yaw for mark in marks], dtype=float)
         xy = np.array([mark.xy for mark in marks], dtype=float).reshape(-1, 2)
         seen = np.array([mark.seen for mark in marks], dtype=float).reshape(-1, 2)
-        return cls(keys, xy, rotations(yaw) - np.eye(2), seen, base.table_homography)
+        table = base.table_homography
+        mm = 1e3 * homography_slopes(np.linalg.inv(table), seen)
+        return cls(keys, xy, rotations(yaw) - np.eye(2), seen, mm, table)
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def __getitem__(self, index: Any) -> Marks:
         keys = tuple(np.array(self.keys, dtype=object)[index])
-        return Marks(keys, self.xy[index], self.turn[index], self.seen[index], self.table)
+        xy, turn, seen, mm = self.xy, self.turn, self.seen, self.mm
+        return Marks(keys, xy[index], turn[index], seen[index], mm[index], self.table)
 
     def stand(self, tcp: Array) -> Array:
         """World places (n, 2), metres, of a pen that is off by tcp (2,) metres."""
@@ -119,12 +125,6 @@ class Marks:
     def on_table_mm(self, xy: Array) -> Array:
         """World (x, y) in millimetres of camera coordinates (n, 2)."""
         return 1e3 * apply_homography(np.linalg.inv(self.table), xy)
-
-    @cached_property
-    def mm(self) -> Array:
-        """(n, 2, 2): millimetres on the table by a unit of the camera's plane, at the circles."""
-        places = apply_homography(np.linalg.inv(self.table), self.seen)
-        return 1e3 * np.linalg.inv(homography_slopes(self.table, places))
 
 
 def rotations(yaw: Array) -> Array:
@@ -155,7 +155,7 @@ class Fit:
     """A refinement with the pen's offset `tcp` (2,), metres, that goes with it.
 
     `normal` is A^T A + diag(penalty) in square millimetres with A (2n, p + 2), tcp in mm coming
-    last; `count` is n.
+    last; `count` is n; `smooth` the radial functions, where there are any.
     """
 
     refinement: Refinement
@@ -163,6 +163,7 @@ class Fit:
     normal: Array
     penalty: Array
     count: int
+    smooth: Smoother | None = None
 
     @property
     def freedom(self) -> float:
@@ -208,7 +209,31 @@ def fit(
         values, tcp = values + step[:-2], tcp + 1e-3 * step[-2:]
         if np.abs(step).max() < NEGLIGIBLE_STEP:
             break
-    return Fit(parameters.refinement(values), tcp, normal, penalty, len(marks))
+    return Fit(parameters.refinement(values), tcp, normal, penalty, len(marks), smooth)
+
+
+def held_out_fits(
+    family: Family, marks: Marks, frame: Frame, found: Fit, fold: Array
+) -> Iterator[tuple[int, Fit]]:
+    """For every fold, numbered by fold (n,), the fit of all other marks; `found` is that of all.
+
+    Without a kernel one Gauss-Newton step from `found` does it: the derivatives of the marks that
+    stay are those of `found`, in which the problem is as good as linear.
+    """
+    numbers = np.unique(fold).tolist()
+    if family.kernel != "none":
+        yield from ((k, fit(family, marks[fold != k], frame, start=found)) for k in numbers)
+        return
+    parameters = _Parameters(family, frame, None)
+    values = parameters.values(found)
+    A, r = _linearise(parameters, values, found.tcp, marks, np.ones(len(marks)))
+    penalty, pull = parameters.penalty(values, found.tcp)
+    for number in numbers:
+        kept = np.repeat(fold != number, 2)
+        normal = A[kept].T @ A[kept] + np.diag(penalty)
+        step = np.linalg.solve(normal, -(A[kept].T @ r[kept] + pull))
+        refinement, tcp = parameters.refinement(values + step[:-2]), found.tcp + 1e-3 * step[-2:]
+        yield number, Fit(refinement, tcp, normal, penalty, int(kept.sum()) // 2)
 
 
 def condition(family: Family, marks: Marks, frame: Frame) -> float:
@@ -220,8 +245,8 @@ def condition(family: Family, marks: Marks, frame: Frame) -> float:
     start = Refinement(family.name, frame.centre, frame.scale)
     columns = _Parameters(family, frame, None).basis(start, start.scaled(marks.chain(np.zeros(2))))
     columns = columns.reshape(2 * len(marks), -1)
-    if columns.shape[1] == 0:
-        return 1.0
+    if columns.shape[1] == 0 or family.known:
+        return 1.0  # nothing to determine, or determined before
     lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     singular = np.linalg.svd(columns / lengths, compute_uv=False)
     short = len(singular) < columns.shape[1]
@@ -232,14 +257,10 @@ def _plain(family: Family) -> Family:
     return replace(family, name="affine", kernel="none")
 
 
-def _smoother(
-    kernel: str, plain: Fit, marks: Marks, frame: Frame, start: Fit | None
-) -> Smoother | None:
-    """None when what the affine fit leaves calls for no smooth part that could be told from it."""
+def _smoother(kernel: str, plain: Fit, marks: Marks, frame: Frame, start: Fit | None) -> Smoother:
     u = plain.refinement.scaled(marks.chain(plain.tcp))
     left = (marks.seen - plain.predict(marks)) / frame.scale
-    length = start.refinement.length if start is not None else None
-    return smoother(kernel, u, left, length)
+    return smoother(kernel, u, left, None if start is None else start.smooth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,15 +291,12 @@ class _Parameters:
         of_H, count = self.family.entries.shape[1], 2 * self.family.monomials
         H = np.eye(3) + np.append(self.family.entries @ values[:of_H], 0.0).reshape(3, 3)
         polynomial = values[of_H : of_H + count].reshape(-1, 2)
-        plain = Refinement(self.family.name, self.frame.centre, self.frame.scale, H, polynomial)
+        plain = (self.family.name, self.frame.centre, self.frame.scale, H, polynomial)
         if self.smooth is None:
-            return plain
-        return replace(
-            plain,
-            kernel=self.smooth.kernel,
-            length=self.smooth.length,
-            nodes=self.smooth.nodes,
-            weights=self.smooth.weights @ values[of_H + count :].reshape(-1, 2),
+            return Refinement(*plain)
+        weights = self.smooth.weights @ values[of_H + count :].reshape(-1, 2)
+        return Refinement(
+            *plain, self.smooth.kernel, self.smooth.length, self.smooth.nodes, weights
         )
 
     def basis(self, at: Refinement, u: Array) -> Array:
@@ -298,6 +316,8 @@ class _Parameters:
         if self.smooth is not None:
             ridge = 2 * self.smooth.weights.shape[1]
             diagonal[-2 - ridge : -2] = self.smooth.ridge * self.frame.mm**2
+        if self.family.known:
+            diagonal[: self.family.entries.shape[1]] = MARK_SIGMA_MM**2
         diagonal[-2:] = (MARK_SIGMA_MM / TCP_PRIOR_MM) ** 2
         return diagonal, diagonal * np.append(values, 1e3 * tcp)
 

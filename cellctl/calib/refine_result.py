@@ -101,9 +101,10 @@ def _by_circle(errors: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class RefineResult:
     """`tcp_mm` (2,): how far the pen stands from where its tip is believed, in world axes at the
-    drawing posture, with its covariance. `errors_mm` (n, 2) are the fit's errors of all circles,
-    predicted minus seen, `used` (n,) those that it rests on. `mark_sigma_mm`: noise of a mark per
-    axis, known with `mark_freedom` degrees of freedom."""
+    drawing posture, with its covariance. `errors_mm` (n, 2) and `errors_px` are the fit's errors
+    of all circles, predicted minus seen, on the table and in the projector; `used` (n,) those
+    that it rests on. `mark_sigma_mm`: noise of a mark per axis, known with `mark_freedom` degrees
+    of freedom."""
 
     refinement: Refinement
     tcp_mm: Array
@@ -113,6 +114,7 @@ class RefineResult:
     candidates: tuple[Candidate, ...]
     keys: tuple[str, ...]
     errors_mm: Array
+    errors_px: Array
     used: Mask
     rejected: tuple[Rejection, ...]
     mark_sigma_mm: float
@@ -141,8 +143,9 @@ class RefineResult:
                 "used": [k for k, ok in zip(self.keys, self.used, strict=True) if ok],
                 "rejected": [r.to_dict() for r in self.rejected],
             },
-            "per_circle_mm": {
-                key: error.tolist() for key, error in zip(self.keys, self.errors_mm, strict=True)
+            "per_circle": {
+                key: {"px": px.tolist(), "mm": mm.tolist()}
+                for key, px, mm in zip(self.keys, self.errors_px, self.errors_mm, strict=True)
             },
             "refinement": self.refinement.to_dict(),
         }

@@ -15,6 +15,7 @@ FAMILIES = (
     "none",
     "shift",
     "similarity",
+    "joint",
     "affine",
     "projective",
     "quadratic",

@@ -32,27 +32,31 @@ NEGLIGIBLE = 1e-7
 @dataclass(frozen=True, eq=False)
 class Smoother:
     """Radial functions about `nodes` (k, 2). A coefficient vector a (q,) stands for the weights
-    `weights` (k, q) @ a, and costs `ridge` |a|^2 beside the squared errors."""
+    `weights` (k, q) @ a, and costs `ridge` |a|^2 beside the squared errors. `theta` (3,): the
+    Gaussian process's logarithms of signal, length and noise, from where a like one may begin."""
 
     kernel: str
     length: float
     nodes: Array
     weights: Array
     ridge: float
+    theta: Array | None = None
 
 
-def smoother(kernel: str, u: Array, left: Array, length: float | None = None) -> Smoother:
+def smoother(kernel: str, u: Array, left: Array, start: Smoother | None = None) -> Smoother:
     """For what an affine fit has left, `left` (n, 2) at u (n, 2).
 
     Thin plate: the ridge with the least leave-one-out error (scikit-learn's RidgeCV). Radial
-    basis: length and ridge of the largest marginal likelihood of a Gaussian process; `length` is
-    where to begin.
+    basis: length and ridge of the largest marginal likelihood of a Gaussian process. `start`, one
+    for almost the same marks, spares steps.
     """
     if kernel == "thin-plate":
         phi, weights = _orthogonal(kernel, 1.0, u)
         return Smoother(kernel, 1.0, u, weights, _cross_validated(phi, u, left))
-    length, ridge = _most_likely(u, left, length)
-    return Smoother(kernel, length, u, _orthogonal(kernel, length, u)[1], ridge)
+    theta = _most_likely(u, left, None if start is None else start.theta)
+    signal, length, noise = np.exp(theta).tolist()
+    weights = _orthogonal(kernel, length, u)[1]
+    return Smoother(kernel, length, u, weights, noise / signal, theta)
 
 
 def _orthogonal(kernel: str, length: float, u: Array) -> tuple[Array, Array]:
@@ -74,13 +78,13 @@ def _cross_validated(phi: Array, u: Array, left: Array) -> float:
     return float(found.alpha_)
 
 
-def _most_likely(u: Array, left: Array, length: float | None) -> tuple[float, float]:
-    """Length and noise-to-signal ratio of variances.
+def _most_likely(u: Array, left: Array, theta: Array | None) -> Array:
+    """Logarithms (3,) of the signal's variance, the length and the noise's variance.
 
     Optimised here, not by scikit-learn, which warns when an optimum lies on a bound: that is an
     answer too, namely that there is nothing but noise.
     """
-    kernel = ConstantKernel(1.0, SIGNAL) * RBF(length or 1.0, LENGTHS) + WhiteKernel(0.5, NOISE)
+    kernel = ConstantKernel(1.0, SIGNAL) * RBF(1.0, LENGTHS) + WhiteKernel(0.5, NOISE)
     process = GaussianProcessRegressor(kernel, optimizer=None)
     process.fit(u, left / max(left.std(), 1e-12))
 
@@ -90,13 +94,8 @@ def _most_likely(u: Array, left: Array, length: float | None) -> tuple[float, fl
         )
         return -value, -slope
 
-    best = minimize(
-        cost,
-        kernel.theta,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=kernel.bounds,
-        options={"ftol": 1e-4},
+    start = kernel.theta if theta is None else theta
+    options = {"ftol": 1e-4}
+    return minimize(
+        cost, start, jac=True, method="L-BFGS-B", bounds=kernel.bounds, options=options
     ).x
-    signal, found, noise = np.exp(best)
-    return float(found), float(noise / signal)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,7 +35,14 @@ class DrawnCell:
 
     def score(self, calibration: Calibration) -> float:
         """true_mm over 110 % of the drawn area."""
-        return float(self.grid.score(calibration.project(self.grid.points), self.truth)["true_mm"])
+        light = self.truth.light_lands(calibration.project(self.grid.points))
+        gap = np.linalg.norm((light - self.pen)[:, :2], axis=1)
+        return 1e3 * float(np.sqrt(np.mean(gap**2)))
+
+    @cached_property
+    def pen(self) -> Array:
+        """Where the pen stands (121, 3) on the scored grid; for many scores of one cell."""
+        return self.truth.pen_lands(self.grid.points[:, :2], self.grid.joints)
 
     @cached_property
     def home(self) -> Array:
@@ -79,11 +85,6 @@ class DrawnCell:
             Mark(f"circle-{i:03d}", xy[i], float(yaws[i]), centres[i], 1 + i // 12)
             for i in range(len(xy))
         ]
-
-    def light(self, calibration: Calibration, xy: Array, rng: np.random.Generator) -> Array:
-        """World (x, y) in mm, as the base measures them, of light sent for xy (n, 2)."""
-        points = np.column_stack([xy, np.full(len(xy), self.grid.height)])
-        return 1e3 * self.truth.light_lands(calibration.project(points))[:, :2]
 
 
 def layout(truth: Truth, rng: np.random.Generator, rounds: int = 5, jitter: float = 0.35) -> Array:
@@ -144,7 +145,3 @@ def _seen(truth: Truth, centres: dict[int, Array], rng: np.random.Generator) -> 
     pixels = pixels + rng.normal(0.0, MARKER_PX, pixels.shape)
     inside = np.all((pixels > 5) & (pixels < np.array(truth.camera.lens.size) - 5), axis=1)
     return {i: p for i, p, ok in zip(ids, pixels, inside, strict=True) if ok}
-
-
-def medians(figures: Sequence[dict[str, float]]) -> dict[str, float]:
-    return {key: float(np.median([f[key] for f in figures])) for key in figures[0]}

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from cellctl.calib.refine import rows, solve_refine
-from cellctl.calib.refine_fit import FAMILIES, LARGEST_CONDITION, Frame, Mark, Marks, condition
+from cellctl.calib.refine_fit import (
+    FAMILIES,
+    LARGEST_CONDITION,
+    Frame,
+    Mark,
+    Marks,
+    condition,
+    fit,
+    held_out_fits,
+)
 from cellctl.calib.refine_result import RefineResult
 from cellctl.calib.refinement import Refinement
 from cellctl.errors import BadInput, SolveError
@@ -106,12 +115,13 @@ def test_the_result_says_what_it_rests_on(cell, whole):
         )
     document = json.loads(json.dumps(whole.to_dict(), allow_nan=False))
     assert Refinement.from_dict(document["refinement"]).to_dict() == whole.refinement.to_dict()
+    assert document["per_circle"]["circle-007"]["px"] == whole.errors_px[7].tolist()
     assert document["candidates"]["cubic"]["allowed"] is True
 
 
 def test_more_freedom_is_not_taken_without_need(cell):
     """Where the truth is a similarity, the richer families fit better and are not chosen."""
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         drawn = synthetic(cell, correction("similarity"), np.zeros(2))
         noisy = [replace(m, seen=m.seen + rng.normal(0, 2e-4, 2)) for m in drawn]
@@ -132,6 +142,29 @@ def test_a_cubic_on_a_grid_is_refused_though_held_out_errors_like_it(cell):
     jittered = Marks.of(cell.marks(layout(cell.truth, rng), rng), cell.base)
     cubic = FAMILIES[-1]
     assert condition(cubic, jittered, Frame.of(jittered)) < LARGEST_CONDITION / 2
+
+
+@pytest.mark.parametrize("family", [f for f in FAMILIES if f.kernel == "none"])
+def test_one_step_without_a_circle_is_the_whole_way(cell, marks, family):
+    drawn = Marks.of(marks, cell.base)
+    frame = Frame.of(drawn)
+    fold = np.arange(len(drawn)) % 7
+    for number, rest in held_out_fits(family, drawn, frame, fit(family, drawn, frame), fold):
+        afresh = fit(family, drawn[fold != number], frame)
+        off = drawn.on_table_mm(rest.predict(drawn)) - drawn.on_table_mm(afresh.predict(drawn))
+        assert np.abs(off).max() < 1e-3
+        assert rest.freedom == pytest.approx(afresh.freedom, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 24])
+@pytest.mark.parametrize("line", [(1.0, 0.0), (0.0, 1.0), (1.0, 0.5), (0.0, 0.0)])
+def test_circles_on_a_line_or_a_spot_determine_no_more_than_they_do(cell, count, line):
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-0.15, 0.15, (count, 1)) * np.array(line)
+    xy = cell.truth.preset.table.centre_m[:2] + along
+    result = solve_refine(cell.marks(xy, rng), cell.base, families=[*PLAIN, "cubic"])
+    assert result.chosen in ("none", "shift", "similarity")
+    assert np.isfinite(result.errors_mm).all()
 
 
 def test_rows_and_columns_are_left_out_whole():
@@ -190,11 +223,11 @@ def test_the_covariance_is_that_of_repeated_solves(cell):
     xy = layout(cell.truth, np.random.default_rng(0))
     found = [
         solve_refine(cell.marks(xy, np.random.default_rng(i)), cell.base, families=["affine"])
-        for i in range(30)
+        for i in range(20)
     ]
     scatter = np.std([r.tcp_mm for r in found], axis=0, ddof=1)
     stated = np.sqrt(np.mean([r.tcp_covariance_mm2.diagonal() for r in found], axis=0))
-    assert np.all(np.abs(np.log(scatter / stated)) < 0.4)
+    assert np.all(np.abs(np.log(scatter / stated)) < 0.5)
 
 
 def test_the_order_of_the_circles_does_not_matter(cell, marks):
