@@ -74,17 +74,16 @@ def printed(sheet: Sheet) -> list[Array]:
     """What is printed on a form: polylines (n, 2) in sheet coordinates. A frame, a grid,
     circles and rings of other sizes than are drawn, and rows of marks that look like text."""
     half = sheet.half - PRINT_EDGE_M
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
+    frame = [_across(axis, side * half[axis], half) for axis in (0, 1) for side in (-1, 1)]
     grid = [
-        line
+        _across(axis, float(at), half)
         for axis in (0, 1)
         for at in np.arange(-half[axis] + PRINT_GRID_M, half[axis], PRINT_GRID_M)
-        for line in [_across(axis, float(at), half)]
     ]
     rng = np.random.default_rng(0)
     spots = rng.uniform(-0.8, 0.8, (8, 2)) * half
     circles = [_circle(spot, r) for spot, r in zip(spots, np.linspace(4e-3, 45e-3, 8), strict=True)]
-    return [corners, *grid, *circles, *_text(half, rng)]
+    return [*frame, *grid, *circles, *_text(half, rng)]
 
 
 def _across(axis: int, at: float, half: Array) -> Array:

@@ -26,6 +26,12 @@ class Region:
     def slices(self) -> tuple[slice, slice]:
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    def meets(self, other: Region) -> bool:
+        """Whether a pixel is in both."""
+        return max(self.left, other.left) < min(self.right, other.right) and max(
+            self.top, other.top
+        ) < min(self.bottom, other.bottom)
+
     def times(self, n: int) -> Region:
         """The same region in pixels of an n-th of the size."""
         return Region(self.left * n, self.top * n, self.right * n, self.bottom * n)

@@ -20,7 +20,7 @@ from cellctl.sim.view import TILE, View, dense
 AMBIENT, PROJECTOR = 0.55, 0.45
 """What a white sheet reflects of the room's and of the projector's light; 1 saturates."""
 WHITE = 255.0
-TABLE_ALBEDO, PAPER_ALBEDO, FLOOR_ALBEDO, MOTTLE = 0.75, 0.79, 0.12, 0.015
+TABLE_ALBEDO, PAPER_ALBEDO, FLOOR_ALBEDO, MOTTLE = 0.75, 0.77, 0.12, 0.015
 GLARE_PEAK, GLARE_WIDTH = 220.0, 0.012
 PIXEL_BOX_VARIANCE = 1.0 / 12.0
 
@@ -70,18 +70,16 @@ class Tabletop:
 
     def take_in(self, ink: Ink) -> list[Region]:
         """Show this ink and no other; returns where the layers have changed."""
-        if not ink and self._inking is None:
-            return []
-        changed: list[Region] = []
-        if self._inking is None or self._inking.holds_more(ink):
+        if self._inking is None:
+            if not ink:
+                return []
             self._inking = Inking(self._truth, self._places)
             self.ambient, self.gain = (layer.copy() for layer in self._blank)
-            changed.append(Region(0, 0, *self.ambient.shape[::-1]))
-        for region in self._inking.add(ink):
+        changed = self._inking.show(ink)
+        for region in changed:
             part = region.slices
             for layer, blank in zip((self.ambient, self.gain), self._blank, strict=True):
                 np.multiply(blank[part], self._inking.left[part], out=layer[part])
-            changed.append(region)
         return changed
 
     def lit(self, smooth: Array | None, region: Region | None = None) -> Array:
