@@ -25,6 +25,7 @@ from cellctl.messages import RobotSnapshot
 from cellctl.motion import GuardedRobot, guard_of
 from cellctl.permission import Permission
 from cellctl.procedures import PROCEDURES
+from cellctl.report import ReportWriter
 from cellctl.sim.drivers import SimCamera, SimProjector, SimRobot
 from cellctl.sim.launch import connect_or_start
 from cellctl.sim.link import SimClock
@@ -77,7 +78,9 @@ async def serve(config: CellConfig) -> AsyncIterator[Engine]:
             projector=devices.projector,
             solver=solver,
         )
-        engine = Engine(cell, list(PROCEDURES.values()), store, gate)
+        reports = ReportWriter()
+        stack.push_async_callback(reports.close)
+        engine = Engine(cell, list(PROCEDURES.values()), store, gate, report=reports.ask)
         server = Server(
             engine, config.bus.listen, config.cell.id, engine.boot, robot=lambda: snapshot(cell)
         )

@@ -8,6 +8,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -49,7 +50,8 @@ class Engine:
 
     `gate` is what the robot of `cell` asks before it moves; the engine opens it for a run.
     `promotes` is asked whether the calibration of a run that is done becomes the active one at
-    once; nobody but a person promotes, unless a policy is given here.
+    once; nobody but a person promotes, unless a policy is given here. `report` is told the folder
+    of every run that has ended, when all else is done; it must neither block nor fail.
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class Engine:
         *,
         limits: Limits | None = None,
         promotes: Callable[[Ending], bool] = lambda _: False,
+        report: Callable[[Path], None] = lambda _: None,
     ) -> None:
         self.boot = secrets.token_hex(8)
         self._cell = cell
@@ -69,6 +72,7 @@ class Engine:
         self._gate = gate
         self._limits = limits or Limits()
         self._promotes = promotes
+        self._report = report
         self._bulletin = Bulletin(self.boot)
         self._commands = asyncio.Lock()
         self._active: ActiveRun | None = None
@@ -308,6 +312,7 @@ class Engine:
         data = {name: value for name, value in ending.as_data().items() if name != "traceback"}
         active.tell("ended", status=ending.status, **data)
         await self._promote_by_policy(ending)
+        self._report(active.record.directory)
 
     async def _promote_by_policy(self, ending: Ending) -> None:
         if ending.calibration_id is None or not self._promotes(ending):

@@ -105,7 +105,7 @@ def test_cancel_and_busy(cellctl):
     assert busy.json["error"]["code"] == "busy"
     assert busy.json["error"]["details"] == {"active_run": run_id}
     assert run_id in cellctl("cancel").out
-    assert cellctl("watch", run_id).out.splitlines()[-2].startswith("CANCELLED")
+    assert cellctl("watch", run_id).out.splitlines()[-3].startswith("CANCELLED")
     assert cellctl("cancel").code == 6
 
 
