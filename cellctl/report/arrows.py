@@ -15,10 +15,11 @@ from cellctl.report.recorded import Recorded
 from cellctl.report.svg import Point, Scale, Svg
 
 WIDTH = 420.0
-MARGIN = 16.0
+MARGIN = 2.0
 BELOW, ABOVE = 56.0, 44.0
-REACH = 0.11
-"""How long the arrow of a typical (root mean square) error is drawn, of the map's longer side."""
+REACH, FURTHEST = 0.10, 0.16
+"""How long the arrow of a typical (root mean square) error is drawn at most, and the longest of
+all, of the map's longer side."""
 MAGNIFICATIONS = [m * 10**e for e in range(5) for m in (1, 2, 5)]
 LEGEND = (
     ("dot train", "drawn circle, used by the fit"),
@@ -146,18 +147,19 @@ def rms_mm(arrows: list[Arrow]) -> float | None:
     return number(math.sqrt(sum(a.length**2 for a in arrows) / len(arrows)))
 
 
-def magnification(typical_mm: float, per_metre: float, side: float) -> int:
+def magnification(arrows: list[Arrow], per_metre: float, side: float) -> int:
     """A round number by which arrows are lengthened; 1 when there is nothing to see."""
-    if not typical_mm > 0:
+    typical, longest = rms_mm(arrows) or 0.0, max(arrow.length for arrow in arrows)
+    if not typical > 0:
         return 1
-    wanted = REACH * side / (typical_mm * 1e-3 * per_metre)
+    wanted = min(REACH / typical, FURTHEST / longest) * side / (1e-3 * per_metre)
     return max([m for m in MAGNIFICATIONS if m <= wanted] or [1])
 
 
 def _map(recorded: Recorded, frame: _Frame, name: str, arrows: list[Arrow]) -> Markup:
     svg = Svg(WIDTH, ABOVE + frame.height + BELOW, f"errors on the table: {name}")
     typical = rms_mm(arrows) or 0.0
-    enlarged = magnification(typical, frame.per_metre, frame.side)
+    enlarged = magnification(arrows, frame.per_metre, frame.side)
     svg.text((MARGIN, 18), name, "heading")
     svg.text((MARGIN, 35), _told(arrows), "label")
     svg.text((WIDTH - MARGIN, 18), f"arrows \N{MULTIPLICATION SIGN}{enlarged}", "strong", "end")

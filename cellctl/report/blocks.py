@@ -20,12 +20,14 @@ class Note:
 
 @dataclass(frozen=True)
 class Figures:
-    """Drawings or pictures side by side: (drawing, caption). `wide`: one to a row."""
+    """Drawings or pictures side by side: (drawing, caption). `wide`: one to a row. `beside`:
+    facts to the right of a single one."""
 
     kind: ClassVar[str] = "figures"
     items: Sequence[tuple[Markup, str]]
     wide: bool = False
     legend: Sequence[tuple[str, str]] = ()
+    beside: Sequence[tuple[str, Any]] = ()
 
 
 @dataclass(frozen=True)

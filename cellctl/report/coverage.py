@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from cellctl.geometry import Array
-from cellctl.report.blocks import Block, Figures, Note, Section
+from cellctl.report.blocks import Block, Figures, Heading, Note, Section
 from cellctl.report.phrases import plural
 from cellctl.report.recorded import Recorded
 from cellctl.report.svg import Scale, Svg, draw_axes, limits
@@ -34,13 +34,13 @@ def section(recorded: Recorded) -> Section:
     frames = list(_frames(recorded))
     blocks: list[Block] = []
     if frames:
-        blocks.append(Figures(frames))
+        blocks += [Heading("In the camera's picture"), Figures(frames)]
     poses = [figure for part, board in BOARDS for figure in _poses(recorded, part, board)]
     if poses:
-        blocks.append(Figures(poses))
+        blocks += [Heading("In the space of poses"), Figures(poses)]
     lead = (
-        "A calibration is good where it was measured. Left of each pair: how the boards were "
-        "tilted; right: how far away and how they were turned in the picture."
+        "A calibration is good where it was measured. The frame is the camera's picture; a board "
+        "that fills it in many tilts, turns and distances leaves little to be guessed."
     )
     if not blocks:
         blocks.append(Note("Nothing was seen by the camera that could cover anything.", "missing"))

@@ -53,27 +53,35 @@ def hand_eye_errors(recorded: Recorded) -> Array:
     return finite(found)
 
 
-def projector_errors(recorded: Recorded) -> Array:
-    """Projector pixels: the map of what the camera saw, against what was shown."""
+def projector_field(recorded: Recorded) -> tuple[Array, Array]:
+    """Projector pixels: where markers were shown (n, 2), and how far from there the map puts what
+    the camera saw of them (n, 2)."""
     part, camera = recorded.part("projector"), camera_of(recorded)
-    shown = shown_centres(recorded)
+    used = at(part, "markers", "used")
     try:
         light = ProjectorMap.from_dict(part.get("projector"))
     except (BadInput, ValueError, TypeError):
-        return NONE
-    used = at(part, "markers", "used")
-    if camera is None or not shown or not isinstance(used, list):
-        return NONE
+        return NONE, NONE
+    if camera is None or not isinstance(used, list):
+        return NONE, NONE
+    shown = shown_centres(recorded)
     seen = [
-        (n, c)
+        (shown[n], centre)
         for _, found in shown_markers(recorded)
-        for n, c in found.items()
+        for n, centre in found.items()
         if n in used and n in shown
     ]
     if not seen:
-        return NONE
-    predicted = light.project(camera.normalise(np.array([centre for _, centre in seen])))
-    return finite([np.array([shown[number] for number, _ in seen]) - predicted])
+        return NONE, NONE
+    places = np.array([place for place, _ in seen])
+    errors = places - light.project(camera.normalise(np.array([centre for _, centre in seen])))
+    known = np.isfinite(errors).all(axis=1)
+    return places[known], errors[known]
+
+
+def projector_errors(recorded: Recorded) -> Array:
+    """Projector pixels: as `projector_field`, the errors alone."""
+    return projector_field(recorded)[1]
 
 
 def shown_centres(recorded: Recorded) -> dict[int, Array]:

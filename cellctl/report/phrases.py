@@ -8,6 +8,7 @@ from typing import Any
 from cellctl.report.odd import number
 
 NONE = "\N{EN DASH}"
+MINUS = "\N{MINUS SIGN}"
 
 
 def figure(value: Any) -> str:
@@ -17,9 +18,9 @@ def figure(value: Any) -> str:
         return NONE
     size = abs(found)
     if size and not 5e-4 <= size < 1e6:
-        return f"{found:.2e}".replace("-", "\N{MINUS SIGN}")
+        return f"{found:.2e}".replace("-", MINUS)
     digits = 0 if size >= 100 else 1 if size >= 10 else 2 if size >= 1 else 3
-    return f"{found:.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{found:.{digits}f}".replace("-", MINUS)
 
 
 def scaled(value: Any, factor: float) -> float | None:

@@ -16,14 +16,8 @@ from cellctl.report.residuals import scatter
 from cellctl.report.svg import Scale, Svg, draw_axes, limits
 
 WIDTH = 420.0
-COLUMNS = (
-    ("training_mm", "training"),
-    ("loo_mm", "one left out"),
-    ("row_mm", "a row left out"),
-    ("training_px", "training"),
-    ("loo_px", "one left out"),
-    ("row_px", "a row left out"),
-)
+COLUMNS = (("training", "training"), ("loo", "one left out"), ("row", "a row left out"))
+ALLOWED = {True: "yes", False: "no"}
 
 
 def section(recorded: Recorded) -> Section:
@@ -50,9 +44,8 @@ def _touched(recorded: Recorded) -> list[Block]:
     normal, point = numbers(at(part, "plane", "normal"), 3), numbers(at(part, "plane", "point"), 3)
     facts = [("points touched", str(len(touches)))] if touches else []
     if point is not None:
-        facts.append(
-            ("height", f"{point[2] * 1e3:.2f} mm at x {point[0]:.3f} m, y {point[1]:.3f} m")
-        )
+        x, y, z = (figure(value) for value in (point[0], point[1], point[2] * 1e3))
+        facts.append(("height", f"{z} mm at x {x} m, y {y} m"))
     if normal is not None:
         tilt = np.degrees(np.arctan2(np.hypot(normal[0], normal[1]), abs(normal[2])))
         facts.append(("tilt", f"{figure(float(tilt))}\N{DEGREE SIGN} against the robot's base"))
@@ -61,10 +54,12 @@ def _touched(recorded: Recorded) -> list[Block]:
             facts.append((words, f"{figure(value)} mm"))
     if (value := number(part.get("rms_mm"))) is not None:
         facts.append(("RMS about the plane", f"{figure(value)} mm"))
-    blocks = [*_opening(part, "Table"), Facts(facts)]
-    if drawing := _touch_map(touches):
-        blocks.append(Figures([(drawing, "touched points: height above the plane, in mm")]))
-    return blocks
+    blocks = _opening(part, "Table")
+    drawing = _touch_map(touches)
+    if drawing is None:
+        return [*blocks, Facts(facts)]
+    words = "touched points: height above the plane, in mm"
+    return [*blocks, Figures([(drawing, words)], beside=facts)]
 
 
 def _touch_map(touches: list[dict[str, Any]]) -> Markup | None:
@@ -94,7 +89,7 @@ def _refined(recorded: Recorded) -> list[Block]:
         return []
     blocks = _opening(part, "Refinement")
     if part.get("chosen") or part.get("why"):
-        blocks.append(Note(f"Chosen: {text(part.get('chosen'))}. {text(part.get('why'))}"))
+        blocks.append(Note(f"Chosen: {text(part.get('chosen'))} ({text(part.get('why'))})."))
     if candidates := mapping(part, "candidates"):
         blocks.append(_candidates(candidates, text(part.get("chosen"))))
     facts = []
@@ -108,27 +103,33 @@ def _refined(recorded: Recorded) -> list[Block]:
 
 
 def _candidates(candidates: dict[str, Any], chosen: str) -> Table:
-    shown = [
-        c for c in COLUMNS if any(number(at(v, c[0])) is not None for v in candidates.values())
-    ]
-    millimetres = sum(name.endswith("mm") for name, _ in shown)
-    columns = [("candidate", False), *((words, True) for _, words in shown)]
+    """In millimetres; in pixels when that is all there is."""
+    known = {
+        unit
+        for unit in ("mm", "px")
+        for name, _ in COLUMNS
+        for value in candidates.values()
+        if number(at(value, f"{name}_{unit}")) is not None
+    }
+    unit = "px" if known == {"px"} else "mm"
+    columns = [("candidate", False), *((f"{words}, {unit}", True) for _, words in COLUMNS)]
     columns += [("condition", True), ("allowed", False), ("remark", False)]
-    groups = [("", 1), ("millimetres", millimetres), ("projector pixels", len(shown) - millimetres)]
     body = [
         [
             text(name),
-            *(figure(at(value, field)) for field, _ in shown),
+            *(figure(at(value, f"{field}_{unit}")) for field, _ in COLUMNS),
             figure(at(value, "condition")),
-            {True: "yes", False: "no"}.get(at(value, "allowed") is True, "")
-            if at(value, "allowed") is not None
-            else "",
+            _allowed(at(value, "allowed")),
             text(at(value, "note")),
         ]
         for name, value in candidates.items()
     ]
     strong = [i for i, row in enumerate(body) if row[0] == chosen]
-    return Table(columns, body, "", [*(g for g in groups if g[1]), ("", 3)], strong)
+    return Table(columns, body, "The chosen one is set off.", strong=strong)
+
+
+def _allowed(value: Any) -> str:
+    return ALLOWED[value] if isinstance(value, bool) else ""
 
 
 # -- evaluate
@@ -140,7 +141,7 @@ def _evaluated(recorded: Recorded) -> list[Block]:
         return []
     blocks = _opening(part, "Proof")
     if part.get("meaning"):
-        blocks.append(Note(text(part["meaning"])))
+        blocks.append(Note(f"What the figure means: {text(part['meaning'])}."))
     facts = [
         (f"held-out error, {unit}", f"{figure(value)} {unit}")
         for unit in ("mm", "px")
@@ -148,10 +149,8 @@ def _evaluated(recorded: Recorded) -> list[Block]:
     ]
     if sure := interval(part.get("held_out_ci_mm")):
         facts.append(("95 % interval", f"{sure} mm"))
-    if facts:
-        blocks.append(Facts(facts))
     errors = evaluated_errors(recorded)
-    if len(errors):
-        words = f"{len(errors)} circles that no fit has seen: light against drawn centre"
-        blocks.append(Figures([(scatter(errors, "mm"), words)]))
-    return blocks
+    if not len(errors):
+        return [*blocks, Facts(facts)]
+    words = f"{len(errors)} circles that no fit has seen: light against drawn centre"
+    return [*blocks, Figures([(scatter(errors, "mm", up=True), words)], beside=facts)]

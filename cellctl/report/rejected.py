@@ -9,6 +9,7 @@ from cellctl.report.recorded import PARTS, Recorded
 
 MOST = 200
 NO_REASON = "no reason was given"
+VOID = "void: it was not finished"
 
 
 def section(recorded: Recorded) -> Section:
@@ -46,11 +47,12 @@ def _of(recorded: Recorded, name: str) -> list[list[str]]:
     for circle in rows(part, "circles"):
         state = text(circle.get("state"))
         if state not in ("", "good"):
-            found.setdefault(("circle", text(circle.get("key"))), state)
+            why = VOID if state == "void" else state
+            found.setdefault(("circle", text(circle.get("key"))), why)
     void = part.get("void")
     for item in void if isinstance(void, list) else []:
         key = text(at(item, "key") or at(item, "id")) if isinstance(item, dict) else text(item)
-        found.setdefault(("circle", key), text(at(item, "reason")) or "void: it was not finished")
+        found.setdefault(("circle", key), text(at(item, "reason")) or VOID)
     found |= _flaws(recorded, name, found)
     return [[name, what, which, why] for (what, which), why in found.items()]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,9 +15,10 @@ from cellctl.geometry import Array
 from cellctl.report import errors_of
 from cellctl.report.blocks import Block, Facts, Figures, Heading, Note, Section, Table
 from cellctl.report.odd import at, mapping, number, numbers, text, texts
-from cellctl.report.phrases import NONE, figure
+from cellctl.report.phrases import MINUS, figure
 from cellctl.report.recorded import Recorded
 from cellctl.report.svg import Scale, Svg, draw_axes, limits
+from cellctl.report.views import size_of
 
 WIDTH, HEIGHT = 420.0, 260.0
 MOST_POINTS = 1500
@@ -93,6 +95,8 @@ def _step(recorded: Recorded, step: Step) -> list[Block]:
     errors = step.errors(recorded)
     if len(errors):
         figures.append((scatter(errors, step.unit), f"{step.against}: {len(errors)} points"))
+    if step.part == "projector" and (field := _field(recorded)) is not None:
+        figures.append(field)
     if figures:
         blocks.append(Figures(figures, legend=BARS if step.bars else ()))
     facts = [*_facts(part), *_more(part)]
@@ -142,9 +146,17 @@ def _camera(matrix: list[Any], lens: Any, sigma: dict[str, Any]) -> list[tuple[s
     values = [cells[0][0], cells[1][1], cells[0][2], cells[1][2], *(numbers(lens, 5) or [])]
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     return [
-        (name, f"{value:.6g} \N{PLUS-MINUS SIGN} {figure(sigma.get(name))}{' px' * (i < 4)}")
+        (name, f"{_measured(value, number(sigma.get(name)))}{' px' * (i < 4)}")
         for i, (name, value) in enumerate(zip(names, values, strict=False))
     ]
+
+
+def _measured(value: float, sigma: float | None) -> str:
+    """With its standard deviation, both to the second digit of the latter."""
+    if sigma is None or not 1e-12 < sigma < 1e6:
+        return f"{value:.6g}".replace("-", MINUS)
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{digits}f} \N{PLUS-MINUS SIGN} {sigma:.{digits}f}".replace("-", MINUS)
 
 
 def _candidates(part: dict[str, Any]) -> Table | None:
@@ -166,7 +178,7 @@ def _bars(found: list[tuple[str, float | None, float | None]], step: Step) -> Ma
     found = found[:MOST_BARS]
     svg = Svg(WIDTH, HEIGHT, f"{step.title}: error of each view")
     values = [value for _, *pair in found for value in pair if value is not None]
-    x = Scale(0, len(found), 52, WIDTH - 10)
+    x = Scale(0, len(found), 64, WIDTH - 10)
     y = Scale(*limits(values, zero=True, margin=0.1), HEIGHT - 34, 12)
     draw_axes(svg, x, y, ("", step.unit))
     width = (x(1) - x(0)) * 0.38
@@ -189,29 +201,42 @@ def _bars(found: list[tuple[str, float | None, float | None]], step: Step) -> Ma
     return svg.markup()
 
 
-def scatter(errors: Array, unit: str) -> Markup:
-    """Errors (n, 2) about zero, with a circle at their root mean square."""
-    height = 300.0
-    svg = Svg(WIDTH, height, f"errors of single points in {unit}")
+def _field(recorded: Recorded) -> tuple[Markup, str] | None:
+    """Where in the projector's picture the errors lie."""
+    places, errors = errors_of.projector_field(recorded)
+    size = size_of(at(recorded.config, "projector", "size_px"))
+    if size is None or not len(errors):
+        return None
+    scale = WIDTH / size[0]
+    svg = Svg(WIDTH, size[1] * scale, "errors over the projector's picture")
+    svg.box((0.5, 0.5), (WIDTH - 0.5, size[1] * scale - 0.5), "frame", rx=3)
+    wanted = 12 / (scale * max(rms(errors), 1e-9))
+    enlarged = max([m * 10**e for e in range(5) for m in (1, 2, 5) if m * 10**e <= wanted] or [1])
+    for (x, y), (dx, dy) in zip(places * scale, errors * (scale * enlarged), strict=True):
+        a = (float(x), float(y))
+        svg.arrow(a, (a[0] + float(dx), a[1] + float(dy)), "arrow train", head=3.5)
+    return (
+        svg.markup(),
+        f"the same over the projector's picture, arrows \N{MULTIPLICATION SIGN}{enlarged}",
+    )
+
+
+def scatter(errors: Array, unit: str, *, up: bool = False) -> Markup:
+    """Errors (n, 2) about zero, with a circle at their root mean square. y runs downwards as in
+    a picture, or `up` as on the table."""
+    top, half = 26.0, 120.0
+    svg = Svg(WIDTH, top + 2 * half + 44, f"errors of single points in {unit}")
     spread = rms(errors)
     reach = max(float(np.quantile(np.abs(errors), 0.995)) * 1.15, spread * 1.3, 1e-6)
-    middle, half = (WIDTH + 30) / 2, (height - 60) / 2
+    middle = (WIDTH + 40) / 2
     x = Scale(-reach, reach, middle - half, middle + half)
-    y = Scale(-reach, reach, 10, 10 + 2 * half)
-    draw_axes(svg, x, Scale(reach, -reach, 10 + 2 * half, 10), (f"x, {unit}", ""))
-    for tick in x.ticks():
-        svg.line((x.start, y(tick)), (x.end, y(tick)), "grid")
-        svg.text(
-            (x.start - 6, y(tick) + 4), f"{tick:.3g}".replace("-", "\N{MINUS SIGN}"), "tick", "end"
-        )
+    low = -reach if up else reach
+    y = Scale(low, -low, top + 2 * half, top)
+    draw_axes(svg, x, y, (f"x, {unit}", f"y, {unit}"))
     shown = errors[:: max(1, len(errors) // MOST_POINTS)]
+    size, cls = (1.6, "point") if len(shown) > 150 else (3.2, "point few")
     for dx, dy in shown[(np.abs(shown) <= reach).all(axis=1)]:
-        svg.dot((x(float(dx)), y(float(dy))), 1.6, "point")
+        svg.dot((x(float(dx)), y(float(dy))), size, cls)
     svg.dot((x(0.0), y(0.0)), x(spread) - x(0.0), "rms")
-    svg.text((x.end, 24), f"RMS {figure(spread)} {unit}", "strong", "end")
+    svg.text((middle, 15), f"RMS {figure(spread)} {unit}", "strong", "middle")
     return svg.markup()
-
-
-def spread_of(errors: Array) -> str:
-    """RMS as a figure."""
-    return figure(rms(errors)) if len(errors) else NONE

@@ -18,7 +18,7 @@ KINDS = (
     ("true", "true", "truth", "true: known only in simulation"),
     ("paper", "paper", "paper", "the paper's figure, on its own cell"),
 )
-WIDTH, ROW_HEIGHT, LEFT = 860.0, 38.0, 150.0
+WIDTH, ROW_HEIGHT, LEFT = 720.0, 36.0, 130.0
 
 
 def section(recorded: Recorded) -> Section:

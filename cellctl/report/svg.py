@@ -133,11 +133,12 @@ class Scale:
         low, high = self.low, self.high
         if self.log:
             low, high, value = math.log(low), math.log(high), math.log(max(value, 1e-12))
-        share = (value - low) / (high - low) if high > low else 0.5
+        share = (value - low) / (high - low) if high != low else 0.5
         return self.start + (self.end - self.start) * share
 
     def ticks(self, wanted: int = 5) -> list[float]:
-        return log_ticks(self.low, self.high) if self.log else ticks(self.low, self.high, wanted)
+        low, high = min(self.low, self.high), max(self.low, self.high)
+        return log_ticks(low, high) if self.log else ticks(low, high, wanted)
 
 
 def draw_axes(
@@ -153,11 +154,9 @@ def draw_axes(
         for tick in y.ticks(int(wanted[1])):
             svg.line((x.start, y(tick)), (x.end, y(tick)), "grid")
             svg.text((x.start - 6, y(tick) + 4), tick_label(tick), "tick", "end")
-        middle = (y.start + y.end) / 2
-        place = f"rotate(-90 14 {middle:.1f})"
-        svg.add(
-            "text", labels[1], cls="axis", x=14, y=middle, text_anchor="middle", transform=place
-        )
+        across, middle = max(x.start - 46, 14.0), (y.start + y.end) / 2
+        turned = f"translate({across:.1f} {middle:.1f}) rotate(-90)"
+        svg.add("text", labels[1], cls="axis", text_anchor="middle", transform=turned)
 
 
 def limits(values: Sequence[float], *, margin: float = 0.06, zero: bool = False) -> Point:

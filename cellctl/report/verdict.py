@@ -71,10 +71,10 @@ def _passed(recorded: Recorded) -> str:
     circles = count(evaluated.get("circles"))
     seen = f"{plural(circles, 'circle')} that no fit has seen" if circles else "circles held out"
     sure = interval(evaluated.get("held_out_ci_mm"))
-    range_of = f" (95 % interval {sure} mm)" if sure else ""
+    range_of = f" (95\N{NO-BREAK SPACE}% interval {sure} mm)" if sure else ""
     return (
-        "The cell is calibrated. Projected light meets the point that the robot means to within "
-        f"{figure(mm)} mm{range_of}, measured on {seen}."
+        "The cell is calibrated. Projected light misses the point that the robot means by "
+        f"{figure(mm)} mm RMS{range_of}, measured on {seen}."
     )
 
 
@@ -105,7 +105,9 @@ def _figures(recorded: Recorded) -> list[tuple[str, str, str, str]]:
     sure = interval(evaluated.get("held_out_ci_mm"))
     for unit in ("mm", "px"):
         if (value := number(evaluated.get(f"held_out_{unit}"))) is not None:
-            remark = f"95 %: {sure} mm" if sure and unit == "mm" else "projector pixels"
+            remark = (
+                f"95\N{NO-BREAK SPACE}%: {sure} mm" if sure and unit == "mm" else "projector pixels"
+            )
             found.append((figure(value), unit, "held-out error", remark))
     truth = at(recorded.truth, "final")
     if (value := number(at(truth, "true_mm"))) is not None:

@@ -3,6 +3,7 @@ figures fit together, and cut-down ones. `python -m tests.report.samples FOLDER`
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -399,18 +400,21 @@ class Writer:
         (folder / "images").mkdir(parents=True)
         self.lines: list[bytes] = []
         self.seconds = 0.2
+        self.pictures = True
+        self.scope = ""
         self.event("journal", {"schema": "cellctl-journal/1", "run_id": RUN_ID})
         self.event("started", {"boot": "dea52982c024c793"})
 
     def event(self, kind: str, data: dict[str, Any], at: str = "", after_s: float = 0.4) -> None:
         self.seconds += after_s
+        at = at.removeprefix(self.scope)
         minutes, seconds = divmod(self.seconds, 60)
         time = f"2026-01-31T06:{15 + int(minutes):02d}:{seconds:09.6f}Z"
         self.lines.append(encode(Entry(len(self.lines), time, kind, at, to_json(data, "sample"))))
 
     def sample(self, at: str, key: str, data: dict[str, Any], image: np.ndarray | None) -> None:
         images = {}
-        if image is not None:
+        if image is not None and self.pictures:
             name = f"{at}/{key}.image.png".replace("/", ".")
             picture = write_picture(self.folder / "images" / name, image)
             images["image"] = {"file": f"images/{name}", "sha256": picture.sha256}
@@ -466,12 +470,14 @@ def write_run(
     verdict: str = "pass",
     until: str = "",
     simulated: bool = True,
+    pictures: bool = True,
     error: str = "the projector's link was lost: check its cable",
     **changes: Any,
 ) -> Path:
     """A run's folder; `until` a part that it did not get to. `changes` go into run.json."""
     writer, drawn = Writer(folder), circles()
     write_document(folder / "run.json", RUN, header(**changes))
+    writer.pictures = pictures
     record(writer, drawn, until)
     reasons = [] if verdict == "pass" else ["evaluate: held-out error 1.90 mm, over the limit"]
     ending: dict[str, Any] = {"error": error}
@@ -489,6 +495,24 @@ def write_run(
         (folder / "report").mkdir()
         (folder / "report" / "truth.json").write_text(json.dumps(truth()))
     return folder
+
+
+def write_alone(folder: Path, part: str) -> Path:
+    """The folder of a run of one procedure by itself, without pictures."""
+    params = header()["params"][part.replace("-", "_")]
+    writer = Writer(folder)
+    writer.pictures, writer.scope = False, f"{part}/"
+    write_document(folder / "run.json", RUN, header(procedure=part, params=params))
+    record(writer, [])
+    data = {"kind": part, **solved(circles())[part]}
+    writer.event("result", {"verdict": "pass", "reasons": [], "data": data, "calibration": None})
+    writer.event("done", {"verdict": "pass"})
+    writer.close()
+    return folder
+
+
+def sha256_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def calibration() -> dict[str, Any]:
