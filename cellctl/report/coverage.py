@@ -26,6 +26,7 @@ from cellctl.report.views import (
 
 WIDTH = 420.0
 BOARDS = (("intrinsic", "checkerboard"), ("hand-eye", "marker board"))
+MOST_CORNERS = 2500
 RINGS = (15, 30, 45, 60)
 
 
@@ -91,8 +92,7 @@ def _board_frame(
     svg, scale = _frame(size, f"{part}: the board in the camera's picture")
     for view in views:
         svg.polygon(hull(view.pixels) * scale, "board", view.key)
-    for x, y in corners[:: max(1, len(corners) // 2500)] * scale:
-        svg.dot((x, y), 1.1, "corner")
+    svg.cloud(corners[:: max(1, len(corners) // MOST_CORNERS)] * scale, "corners")
     share = _covered(corners, size)
     return (
         svg.markup(),

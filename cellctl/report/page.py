@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import structlog
@@ -73,22 +74,29 @@ def _alone(directory: Path) -> Iterator[None]:
 
 def render(recorded: Recorded) -> str:
     """The page as HTML."""
-    environment = Environment(
+    return (
+        _environment()
+        .get_template("report.html")
+        .render(
+            run_id=text(recorded.header.run_id),
+            cell=text(recorded.header.cell),
+            procedure=text(recorded.header.procedure),
+            verdict=verdict_of(recorded),
+            sections=[_made(name, make, recorded) for name, make in SECTIONS],
+            incomplete=len(recorded.problems),
+            written=utc_now(),
+        )
+    )
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
         loader=PackageLoader("cellctl.report"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
-    )
-    return environment.get_template("report.html").render(
-        run=recorded.header,
-        run_id=text(recorded.header.run_id),
-        cell=text(recorded.header.cell),
-        procedure=text(recorded.header.procedure),
-        verdict=verdict_of(recorded),
-        sections=[_made(name, make, recorded) for name, make in SECTIONS],
-        incomplete=len(recorded.problems),
-        written=utc_now(),
     )
 
 

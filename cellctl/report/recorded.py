@@ -59,9 +59,8 @@ class Recorded:
 
     def part(self, name: str) -> dict[str, Any]:
         """What one part came to: of `full` under its name, of a procedure alone all there is."""
-        found = mapping(self.data, name)
         kind = self.data.get("kind", self.header.procedure)
-        return found or (self.data if kind == name else {})
+        return self.data if kind == name else mapping(self.data, name)
 
     def params(self, name: str) -> dict[str, Any]:
         """The parameters of one part."""

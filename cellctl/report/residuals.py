@@ -21,7 +21,7 @@ from cellctl.report.svg import Scale, Svg, draw_axes, limits
 from cellctl.report.views import size_of
 
 WIDTH, HEIGHT = 420.0, 260.0
-MOST_POINTS = 1500
+MOST_POINTS, FEW_POINTS = 1500, 150
 MOST_BARS = 60
 BARS = (("bar train", "in the fit"), ("bar held", "held out: predicted by a fit without this view"))
 
@@ -234,9 +234,9 @@ def scatter(errors: Array, unit: str, *, up: bool = False) -> Markup:
     y = Scale(low, -low, top + 2 * half, top)
     draw_axes(svg, x, y, (f"x, {unit}", f"y, {unit}"))
     shown = errors[:: max(1, len(errors) // MOST_POINTS)]
-    size, cls = (1.6, "point") if len(shown) > 150 else (3.2, "point few")
-    for dx, dy in shown[(np.abs(shown) <= reach).all(axis=1)]:
-        svg.dot((x(float(dx)), y(float(dy))), size, cls)
+    inside = shown[(np.abs(shown) <= reach).all(axis=1)]
+    places = ((x(float(dx)), y(float(dy))) for dx, dy in inside)
+    svg.cloud(places, "points" if len(inside) > FEW_POINTS else "points few")
     svg.dot((x(0.0), y(0.0)), x(spread) - x(0.0), "rms")
     svg.text((middle, 15), f"RMS {figure(spread)} {unit}", "strong", "middle")
     return svg.markup()

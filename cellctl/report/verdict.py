@@ -105,9 +105,8 @@ def _figures(recorded: Recorded) -> list[tuple[str, str, str, str]]:
     sure = interval(evaluated.get("held_out_ci_mm"))
     for unit in ("mm", "px"):
         if (value := number(evaluated.get(f"held_out_{unit}"))) is not None:
-            remark = (
-                f"95\N{NO-BREAK SPACE}%: {sure} mm" if sure and unit == "mm" else "projector pixels"
-            )
+            sure_of_it = f"95\N{NO-BREAK SPACE}%: {sure} mm" if sure and unit == "mm" else ""
+            remark = sure_of_it or ("projector pixels" if unit == "px" else "")
             found.append((figure(value), unit, "held-out error", remark))
     truth = at(recorded.truth, "final")
     if (value := number(at(truth, "true_mm"))) is not None:

@@ -36,6 +36,11 @@ class ReportWriter:
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._write_all(), name="write reports")
 
+    async def written(self) -> None:
+        """Wait until all that was asked for is written, or logged as impossible."""
+        if self._task is not None:
+            await asyncio.wait({self._task})
+
     async def close(self) -> None:
         """Give up what is not written yet; idempotent."""
         self._closed = True
@@ -45,13 +50,16 @@ class ReportWriter:
                 await self._task
 
     async def _write_all(self) -> None:
-        """A process for as long as there is something to write."""
-        async with Child("report") as child:
-            while self._wanted:
-                directory = self._wanted.pop(0)
-                try:
-                    path = await child.call(write_report, directory, timeout_s=self._timeout_s)
-                except CellctlError as error:
-                    log.warning("no report was written", run=directory.name, error=error.message)
-                else:
-                    log.info("report", run=directory.name, path=str(path))
+        """In a process that lives as long as there is something to write."""
+        while self._wanted:
+            async with Child("report") as child:
+                while self._wanted:
+                    await self._write(child, self._wanted.pop(0))
+
+    async def _write(self, child: Child, directory: Path) -> None:
+        try:
+            path = await child.call(write_report, directory, timeout_s=self._timeout_s)
+        except CellctlError as error:
+            log.warning("no report was written", run=directory.name, error=error.message)
+        else:
+            log.info("report", run=directory.name, path=str(path))

@@ -19,6 +19,7 @@ class Page(HTMLParser):
         self.faults: list[str] = []
         self.open: list[str] = []
         self.ids: list[str] = []
+        self.starts: dict[str, int] = {}
         self.words: list[str] = []
         self.pictures = 0
         self.feed(html)
@@ -31,6 +32,12 @@ class Page(HTMLParser):
     @property
     def text(self) -> str:
         return " ".join(" ".join(self.words).split())
+
+    def section(self, name: str) -> str:
+        """The text from one id to the next."""
+        first = self.starts[name]
+        after = min([n for n in self.starts.values() if n > first] or [len(self.words)])
+        return " ".join(" ".join(self.words[first:after]).split())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self._look_at(tag, attrs)
@@ -61,6 +68,7 @@ class Page(HTMLParser):
                 self.faults.append(f"{name}={value!r} leads out of the file")
             if name == "id":
                 self.ids.append(value or "")
+                self.starts[value or ""] = len(self.words)
             if (value or "").startswith("data:"):
                 self.pictures += 1
             if (value or "").lower() in ("nan", "inf", "-inf"):

@@ -435,11 +435,13 @@ def picture(marks: list[Any], seed: int, *, rings: bool = False) -> np.ndarray:
     return np.asarray(np.clip(image + noise, 0, 255), np.uint8)
 
 
-def record(writer: Writer, drawn: list[dict[str, Any]], until: str = "") -> None:
-    """The samples of a full run, up to a part."""
+def record(
+    writer: Writer, drawn: list[dict[str, Any]], until: str = "", counts: tuple[int, int] = (24, 10)
+) -> None:
+    """The samples of a full run, up to a part; `counts` of views, intrinsic and hand-eye."""
     boards = {
-        "intrinsic": (views(24, board_points(9, 6, 0.03), 0.05, 1), "intrinsic/views"),
-        "hand-eye": (views(10, board_points(6, 8, 0.03), 0.2, 2), "hand-eye/views"),
+        "intrinsic": (views(counts[0], board_points(9, 6, 0.03), 0.05, 1), "intrinsic/views"),
+        "hand-eye": (views(counts[1], board_points(6, 8, 0.03), 0.2, 2), "hand-eye/views"),
     }
     for name, (found, at) in boards.items():
         if name == until:
@@ -471,6 +473,7 @@ def write_run(
     until: str = "",
     simulated: bool = True,
     pictures: bool = True,
+    counts: tuple[int, int] = (24, 10),
     error: str = "the projector's link was lost: check its cable",
     **changes: Any,
 ) -> Path:
@@ -478,7 +481,7 @@ def write_run(
     writer, drawn = Writer(folder), circles()
     write_document(folder / "run.json", RUN, header(**changes))
     writer.pictures = pictures
-    record(writer, drawn, until)
+    record(writer, drawn, until, counts)
     reasons = [] if verdict == "pass" else ["evaluate: held-out error 1.90 mm, over the limit"]
     ending: dict[str, Any] = {"error": error}
     if status == "done":

@@ -34,7 +34,9 @@ ODD = st.one_of(
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """A complete run with few views and no pictures, once for all examples."""
-    run = samples.write_run(tmp_path_factory.mktemp("runs") / samples.RUN_ID, pictures=False)
+    run = samples.write_run(
+        tmp_path_factory.mktemp("runs") / samples.RUN_ID, pictures=False, counts=(3, 3)
+    )
     result = json.loads((run / "result.json").read_text())
     return run, result, read(run / "journal.jsonl").entries
 
@@ -43,20 +45,29 @@ def spoilt(draw: st.DataObject, document: Any, times: int = 3) -> Any:
     """A copy with odd values, or nothing, in some places."""
     document = copy.deepcopy(document)
     for _ in range(draw.draw(st.integers(1, times))):
-        holder, key = None, None
-        at = document
-        while isinstance(at, dict | list) and at and (holder is None or draw.draw(st.booleans())):
-            holder = at
-            names = list(at) if isinstance(at, dict) else list(range(len(at)))
-            key = draw.draw(st.sampled_from(names))
-            at = at[key]
-        if holder is None:
-            return document
-        if draw.draw(st.booleans()):
-            holder[key] = draw.draw(ODD)
-        else:
-            del holder[key]
+        places = [(document, name) for name in _names(document)]
+        while places:
+            holder, name = draw.draw(st.sampled_from(places))
+            inner = [(holder[name], key) for key in _names(holder[name])]
+            if not inner or draw.draw(st.booleans()):
+                if draw.draw(st.booleans()):
+                    holder[name] = draw.draw(ODD)
+                else:
+                    del holder[name]
+                break
+            places = inner
     return document
+
+
+def _names(value: Any) -> list[Any]:
+    """Of the members of an object or a list."""
+    return (
+        list(value)
+        if isinstance(value, dict)
+        else list(range(len(value)))
+        if isinstance(value, list)
+        else []
+    )
 
 
 def check(run: Path) -> None:
@@ -65,7 +76,7 @@ def check(run: Path) -> None:
     assert "could not be made" not in page.text
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 def test_an_odd_result(small, data):
     run, result, _ = small
@@ -77,7 +88,7 @@ def test_an_odd_result(small, data):
         path.write_text(json.dumps(result))
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.data())
 def test_odd_events(small, data):
     run, _, entries = small
@@ -96,7 +107,7 @@ def test_odd_events(small, data):
         path.write_bytes(original)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(st.data())
 def test_an_odd_header_and_truth(small, data):
     run, _, _ = small
@@ -111,7 +122,7 @@ def test_an_odd_header_and_truth(small, data):
         truth.write_bytes(originals[1])
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(content=st.binary(max_size=200), name=st.sampled_from(["run.json", "result.json"]))
 def test_bytes_instead_of_json(small, content, name):
     run, _, _ = small
