@@ -27,6 +27,7 @@ from cellctl.motion import guard_of
 from cellctl.permission import Permission
 from cellctl.procedures import PROCEDURES
 from cellctl.promotion import by_hand, not_worse
+from cellctl.report import ReportWriter
 from cellctl.sim.drivers import SimCamera, SimProjector, SimRobot
 from cellctl.sim.launch import connect_or_start
 from cellctl.sim.link import SimClock
@@ -81,8 +82,17 @@ async def serve(config: CellConfig) -> AsyncIterator[Engine]:
             solver=solver,
             sheets=await store.in_order(SheetLedger, directory, store.in_order),
         )
+        reports = ReportWriter()
+        stack.push_async_callback(reports.close)
         policy = not_worse if config.promotion.policy == "not-worse" else by_hand
-        engine = Engine(cell, list(PROCEDURES.values()), store, gate, promotes=policy)
+        engine = Engine(
+            cell,
+            list(PROCEDURES.values()),
+            store,
+            gate,
+            promotes=policy,
+            report=reports.ask,
+        )
         server = Server(
             engine, config.bus.listen, config.cell.id, engine.boot, robot=lambda: snapshot(cell)
         )

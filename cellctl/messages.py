@@ -184,6 +184,7 @@ class RunInfo(Message):
     question: Question | None = None
     calibration_id: str | None = None
     directory: str = ""
+    report: str | None = None
     result: dict[str, Any] | None = None
 
 

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import typer
 
-from cellctl.cli import boards, hosting, offline, reading, running
-from cellctl.cli.output import note, report
+from cellctl.cli import boards, hosting, offline, reading, reports, running
+from cellctl.cli.output import note
+from cellctl.cli.output import report as report_error
 from cellctl.errors import BadInput, CellctlError
 
 app = typer.Typer(
@@ -35,6 +36,7 @@ for command in (
     hosting.enable,
     offline.plan,
     offline.solve,
+    reports.report,
     offline.check_config,
     hosting.demo,
 ):
@@ -49,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = app(args=arguments, prog_name="cellctl", standalone_mode=False)
     except CellctlError as error:
-        return report(error, as_json=as_json)
+        return report_error(error, as_json=as_json)
     except typer.TyperException as error:
         return _report_usage(error, as_json)
     except BrokenPipeError:  # the reader of stdout has left; nothing is to be flushed to it at exit
@@ -62,4 +64,4 @@ def _report_usage(error: typer.TyperException, as_json: bool) -> int:
     """A wrong option or argument, or a file that cannot be opened."""
     wrong = BadInput(error.format_message())
     note("Usage: `cellctl --help` and `cellctl COMMAND --help` tell more.")
-    return report(wrong, as_json=as_json)
+    return report_error(wrong, as_json=as_json)

@@ -90,12 +90,15 @@ def _print_runs(known: Runs) -> None:
 
 
 def show(
-    name: Annotated[str, typer.Argument(metavar="RUN|CALIBRATION", help="`active` is one too.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="[RUN|CALIBRATION]", help="`active` is one too; none: the newest."),
+    ] = None,
     as_json: AsJson = False,
     endpoint: Connect = HERE,
     cell: CellId = None,
 ) -> None:
-    """A run or a calibration, whole."""
+    """A run or a calibration, whole; the newest run if none is named."""
     with connect(endpoint, cell) as client:
         found = _find(client, name)
     if as_json:
@@ -106,7 +109,17 @@ def show(
         _print_calibration(found)
 
 
-def _find(client: Client, name: str) -> RunInfo | CalibrationInfo:
+def newest_run(client: Client) -> str:
+    """Its id. NotFound when there is none."""
+    known = client.runs(limit=1).runs
+    if not known:
+        raise NotFound("there are no runs yet; start one with `cellctl run PROCEDURE`")
+    return known[0].run_id
+
+
+def _find(client: Client, name: str | None) -> RunInfo | CalibrationInfo:
+    if name is None:
+        return client.run_info(newest_run(client))
     try:
         return client.calibration(name) if name == "active" else client.run_info(name)
     except NotFound as error:

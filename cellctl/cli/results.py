@@ -27,6 +27,7 @@ def print_run(run: RunInfo) -> None:
     facts = {
         "calibration": run.calibration_id,
         "recorded": f"{run.samples} samples in {run.directory}" if run.directory else None,
+        "report": words.report(run),
     }
     print_data({name: value for name, value in facts.items() if value})
     for text in words.advice(run):

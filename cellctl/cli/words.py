@@ -27,6 +27,13 @@ def headline(run: RunInfo) -> str:
     return f"{text} {run.error}" if run.error else text
 
 
+def report(run: RunInfo) -> str | None:
+    """Where the report of a run is, or how to get it; None while the run goes on."""
+    if run.status in ("running", "waiting"):
+        return None
+    return run.report or f"not written yet: cellctl report {run.run_id}"
+
+
 def advice(run: RunInfo) -> list[str]:
     """What can be done next."""
     if run.status == "interrupted":

@@ -8,6 +8,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -52,7 +53,8 @@ class Engine:
     `gate` is what the robot of `cell` asks before it moves; the engine opens it for a run.
     `promotes` is asked whether the calibration file that a run has left takes the place of the
     active one (None: there is none) at once; nobody but a person promotes, unless a policy is
-    given here.
+    given here. `report` is told the folder of every run that has ended, when all else is done;
+    it must neither block nor fail.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Engine:
         *,
         limits: Limits | None = None,
         promotes: Policy = lambda _new, _active: False,
+        report: Callable[[Path], None] = lambda _: None,
     ) -> None:
         self.boot = secrets.token_hex(8)
         self._cell = cell
@@ -72,6 +75,7 @@ class Engine:
         self._gate = gate
         self._limits = limits or Limits()
         self._promotes = promotes
+        self._report = report
         self._bulletin = Bulletin(self.boot)
         self._commands = asyncio.Lock()
         self._active: ActiveRun | None = None
@@ -311,6 +315,7 @@ class Engine:
         data = {name: value for name, value in ending.as_data().items() if name != "traceback"}
         active.tell("ended", status=ending.status, **data)
         await self._promote_by_policy(ending)
+        self._report(active.record.directory)
 
     async def _promote_by_policy(self, ending: Ending) -> None:
         new = ending.calibration_id

@@ -22,6 +22,11 @@ RESULT = Schema("cellctl-result", 1)
 JOURNAL = "journal.jsonl"
 
 
+def report_path(directory: Path) -> Path:
+    """Where the report of a run lies, once it is written."""
+    return directory / "report" / "index.html"
+
+
 class RunHeader(BaseModel):
     """run.json: all that is fixed when a run starts. `speed` is in percent."""
 
@@ -55,6 +60,7 @@ class RunFolder:
     def info(self) -> RunInfo:
         """What travels; without the result, which is on disk."""
         header, standing = self.header, self.standing
+        report = report_path(self.directory)
         progress = Progress(
             run_id=header.run_id,
             step=standing.step,
@@ -76,6 +82,7 @@ class RunFolder:
             question=standing.question,
             calibration_id=standing.calibration_id,
             directory=str(self.directory),
+            report=str(report) if report.exists() else None,
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 
 import pytest
 
@@ -105,7 +106,7 @@ def test_cancel_and_busy(cellctl):
     assert busy.json["error"]["code"] == "busy"
     assert busy.json["error"]["details"] == {"active_run": run_id}
     assert run_id in cellctl("cancel").out
-    assert cellctl("watch", run_id).out.splitlines()[-2].startswith("CANCELLED")
+    assert cellctl("watch", run_id).out.splitlines()[-3].startswith("CANCELLED")
     assert cellctl("cancel").code == 6
 
 
@@ -174,6 +175,19 @@ def test_procedures_and_runs_are_listed(cellctl):
     assert "count" in cellctl("runs", "--limit", "1").out
 
 
+def test_a_report_is_written_and_shown(cellctl):
+    run_id = started(cellctl, "count")
+    assert cellctl("watch", run_id).code == 0
+    assert f"not written yet: cellctl report {run_id}" in cellctl("show").out
+    said = cellctl("report", "latest")
+    assert said.code == 0
+    path = Path(said.out.strip())
+    assert run_id in path.read_text()
+    assert said.out.strip() in " ".join(cellctl("show").out.split())
+    assert cellctl("show", "--json").json["report"] == str(path)
+    assert cellctl("report", run_id, "--json").json == {"run": run_id, "report": str(path)}
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
@@ -193,7 +207,10 @@ def test_procedures_and_runs_are_listed(cellctl):
         (["status", "--cell", "UPPER"], 2, "cell id"),
         (["nope"], 2, "No such command"),
         (["status", "--nope"], 2, "--nope"),
-        (["show"], 2, "RUN|CALIBRATION"),
+        (["show"], 6, "there are no runs yet"),
+        (["report", "nope"], 6, "no run 'nope'"),
+        (["report", "latest"], 6, "there are no runs yet"),
+        (["report", "nowhere/at-all"], 6, "no such folder"),
     ],
 )
 def test_errors_are_text_with_an_exit_code_and_json_when_asked(cellctl, arguments, code, text):

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from cellctl.bus.session import free_endpoint
 from cellctl.cli.boards import OPTIONS
 from cellctl.local import DEFAULT_ENDPOINT
 from cellctl.permission import FILE
+from tests.report import samples
 
 ROOT = Path(__file__).parents[2]
 
@@ -111,3 +113,21 @@ def test_check_config_of_the_cell_that_is_shipped(offline):
     assert said.json["valid"]
     assert (said.json["cell"], said.json["arm"]) == ("sim-cr", "ur5")
     assert said.json["listen"] == DEFAULT_ENDPOINT
+
+
+def test_a_report_of_a_folder_needs_no_daemon(offline, tmp_path):
+    run = samples.write_run(tmp_path / "runs" / samples.RUN_ID, pictures=False, counts=(3, 3))
+    said = offline("report", str(run))
+    assert (said.code, said.out.strip()) == (0, str(run / "report" / "index.html"))
+    assert offline("report", str(tmp_path)).code == 2
+
+
+def test_without_a_daemon_a_run_is_found_in_the_data_directory(offline, tmp_path, monkeypatch):
+    run = samples.write_run(tmp_path / "runs" / samples.RUN_ID, pictures=False, counts=(3, 3))
+    monkeypatch.setenv("CELLCTL_CONNECT", free_endpoint())
+    monkeypatch.setenv("CELLCTL_DATA", str(tmp_path))
+    for name in ("latest", samples.RUN_ID):
+        assert offline("report", name).out.strip() == str(run / "report" / "index.html")
+    assert offline("report", "nope").code == 5
+    monkeypatch.delenv("CELLCTL_DATA")
+    assert "name the run's folder" in offline("report", "latest").err
