@@ -13,7 +13,7 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.plane import Plane
 from cellctl.calib.projector_map import ProjectorMap
 from cellctl.calib.refinement import Refinement
-from cellctl.calib.table import TableSurface
+from cellctl.calib.table_surface import TableSurface
 from cellctl.errors import BadInput
 from cellctl.geometry import Array, Transform, as_transform
 
@@ -61,8 +61,9 @@ class Calibration:
         return (self.T_world_camera.inverse().matrix @ lift)[:3]
 
     @property
-    def T_camera_table(self) -> Array:
-        """(4, 4): from a frame on the table, whose x and y are the world's as seen from above."""
+    def table_frame(self) -> Array:
+        """T_camera_table (4, 4): of a frame on the table's plane, whose x and y are the world's as
+        seen from above."""
         foot = np.array([0.0, 0.0, float(self.table.height(np.zeros(2)))])
         normal = self.table.normal * np.sign(self.table.normal[2])
         x = np.cross((0.0, 1.0, 0.0), normal)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from cellctl.calib.calibration import Plane
+from cellctl.calib.plane import Plane
 from cellctl.calib.views import Rejection
 from cellctl.errors import BadInput
 from cellctl.geometry import Array

@@ -76,7 +76,7 @@ def drawing_of(
             f"{1e3 * surface.bow_m:.1f} mm, together more than half of the {1e3 * travel:.1f} mm "
             "that the pen holder gives way: measure more touches, or flatten the table"
         )
-    rig = pen_rig(config, guard, surface, here)
+    rig = pen_rig(config, guard, surface, surface.plane.normal, here)
     return Drawing(
         rig=rig,
         radius=radius_of(base, params.radius_mm),

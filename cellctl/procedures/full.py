@@ -13,7 +13,7 @@ from typing import Any
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.refine_result import RefineResult
 from cellctl.calib.stages import Stage
-from cellctl.calib.table import TableResult
+from cellctl.calib.table_surface import TableSurface
 from cellctl.cell import Cell
 from cellctl.errors import SolveError
 from cellctl.procedures import (
@@ -110,7 +110,7 @@ def base_of(record: Record[FullParams]) -> Calibration | None:
     failed = any(seen.judged(record.params).values())
     if failed or measure_table.judge(table, record.params.measure_table)[1]:
         return None
-    return seen.calibration(table.surface.plane).on(table.surface)
+    return seen.calibration(table.plane).on(table)
 
 
 def refined_of(record: Record[FullParams], base: Calibration) -> Calibration | None:
@@ -119,7 +119,7 @@ def refined_of(record: Record[FullParams], base: Calibration) -> Calibration | N
     return None if ink.reasons or ink.result is None else refine.refined(base, ink.result)
 
 
-def _table(record: Record[FullParams]) -> TableResult:
+def _table(record: Record[FullParams]) -> TableSurface:
     return measure_table.solve(record.scoped(TABLE, record.params.measure_table))
 
 
@@ -159,8 +159,11 @@ def conclude(record: Record[FullParams]) -> Result:
     stages = seen.stages(record.config)
     reasons = dict(seen.judged(params))
     reasons[TABLE] = measure_table.judge(table, params.measure_table)[1]
-    data: dict[str, Any] = {**seen.data(), TABLE: table.to_dict()}
-    best = seen.calibration(table.surface.plane).on(table.surface)
+    data: dict[str, Any] = {
+        **seen.data(),
+        TABLE: measure_table.told(record.scoped(TABLE, params.measure_table), table),
+    }
+    best = seen.calibration(table.plane).on(table)
     if record.scoped(DRAW, params.draw).samples(draw.CIRCLES):
         best = _prove(record, best, stages, data, reasons)
     for part, why in reasons.items():

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.calib import table
 from cellctl.calib.calibration import Calibration
-from cellctl.calib.table import TableResult
+from cellctl.calib.table_surface import Area, TableSurface
 from cellctl.cell import Cell
 from cellctl.drivers.base import RobotState
 from cellctl.errors import BadInput
@@ -48,7 +48,8 @@ class MeasureTableParams(BaseModel):
 
 async def collect(run: Run, cell: Cell, params: MeasureTableParams) -> None:
     """Touch the table; the samples are in the run."""
-    rig = pen_rig(cell.config, cell.guard, table_plane(cell.config), await posture(run, cell))
+    known = table_plane(cell.config)
+    rig = pen_rig(cell.config, cell.guard, known, known.normal, await posture(run, cell))
     await run.step(TOUCHES, params.touches)
     spots = await paper.planned(run, cell, rig, params.touches, DOT_M, params.seed)
     hubs = np.array([spot.joints for spot in spots])
@@ -115,34 +116,50 @@ def _tip(sample: Sample, tip: Array) -> Array:
     return pose.apply(tip)
 
 
-def solve(record: Record[MeasureTableParams]) -> TableResult:
+def solve(record: Record[MeasureTableParams]) -> TableSurface:
     """Pure: the surface through the touched points."""
     touched = seen(record)
     low, high = area(record.config)
     points = np.array(list(touched.values())).reshape(-1, 3)
-    return table.solve_table(points, ids=tuple(touched), area=(low, high))
+    return table.solve_table(points, ids=list(touched), area=Area(low, high))
 
 
-def judge(result: TableResult, params: MeasureTableParams) -> tuple[str, tuple[str, ...]]:
+def judge(surface: TableSurface, params: MeasureTableParams) -> tuple[str, tuple[str, ...]]:
     """Pass or fail, with reasons."""
-    limits = table.TableLimits(uncertainty_m=1e-3 * params.max_uncertainty_mm)
-    return table.judge(result, limits)
+    return table.judge(surface, table.TableLimits(uncertainty_mm=params.max_uncertainty_mm))
 
 
 def conclude(record: Record[MeasureTableParams]) -> Result:
     """Pure: from what was recorded to the surface; with an active calibration, that one with this
     table."""
-    result = solve(record)
-    _, reasons = judge(result, record.params)
-    data = {"kind": "measure-table", **result.to_dict()}
-    return Result.judged(reasons, data, _calibration(record, result))
+    surface = solve(record)
+    _, reasons = judge(surface, record.params)
+    data = {"kind": "measure-table", **told(record, surface)}
+    return Result.judged(reasons, data, _calibration(record, surface))
 
 
-def _calibration(record: Record[Any], result: TableResult) -> dict[str, Any] | None:
+def told(record: Record[MeasureTableParams], surface: TableSurface) -> dict[str, Any]:
+    """The surface, with each touch and how far it is off."""
+    touched = seen(record)
+    touches = [
+        {
+            "key": key,
+            "x": float(x),
+            "y": float(y),
+            "z": float(z),
+            "residual_mm": float(1e3 * (z - surface.height(np.array([[x, y]]))[0])),
+        }
+        for key, (x, y, z) in touched.items()
+    ]
+    rejected = [r.to_dict() for r in surface.rejected]
+    return {**surface.to_dict(), "touches": touches, "rejected": rejected}
+
+
+def _calibration(record: Record[Any], surface: TableSurface) -> dict[str, Any] | None:
     if record.active is None:
         return None
     active = Calibration.from_dict(record.active, "active calibration")
-    return active.on(result.surface).to_dict()
+    return active.on(surface).to_dict()
 
 
 async def run_measure_table(run: Run, cell: Cell, params: MeasureTableParams) -> Result:

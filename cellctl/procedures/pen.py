@@ -32,24 +32,25 @@ MOST_TURN_RAD = 0.1
 
 
 class Surface(Protocol):
-    """The table: `height` (n,) of xy (n, 2), and its unit normal (3,), in the world."""
+    """The table."""
 
-    def height(self, xy: Array) -> Array: ...
-
-    @property
-    def normal(self) -> Array: ...
+    def height(self, xy: Array) -> Array:
+        """z (n,) at xy (n, 2), in the world, metres."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class PenRig:
     """What leading the pen needs. `tip` (3,) in the flange frame as the config says; `posture` (6,)
-    is on the branch that draws, `upright` (3, 3) the tool's orientation there, made upright."""
+    is on the branch that draws, `upright` (3, 3) the tool's orientation there, made upright;
+    `normal` (3,) is the table's."""
 
     guard: Guard
     tip: Array
     posture: Array
     upright: Array
     surface: Surface
+    normal: Array
     depth: float
     lift: float
 
@@ -63,7 +64,7 @@ class PenRig:
 
     def over(self, xy: Array, height: float) -> Array:
         """Points (n, 3), `height` over the table along its normal."""
-        return self.on_table(xy) + height * self.surface.normal
+        return self.on_table(xy) + height * self.normal
 
     def on_table(self, xy: Array) -> Array:
         """World points (n, 3) of xy (n, 2)."""
@@ -88,7 +89,9 @@ class PenRig:
         return joints, np.logical_and(found, turned_found)
 
 
-def pen_rig(config: CellConfig, guard: Guard, surface: Surface, here: Array) -> PenRig:
+def pen_rig(
+    config: CellConfig, guard: Guard, surface: Surface, normal: Array, here: Array
+) -> PenRig:
     """The rig of a configured cell; `here` (6,) decides the branch where the config does not.
 
     MotionRefused when the pen cannot stand upright over the middle of the table.
@@ -100,7 +103,9 @@ def pen_rig(config: CellConfig, guard: Guard, surface: Surface, here: Array) -> 
         upright = _upright(guard.arm.forward(posture)[:3, :3], tip)
     else:
         posture, upright = _found_posture(config, guard, tip, here), DOWN
-    return PenRig(guard, tip, posture, upright, surface, pen.travel_m / 2, free_height(guard))
+    return PenRig(
+        guard, tip, posture, upright, surface, normal, pen.travel_m / 2, free_height(guard)
+    )
 
 
 def free_height(guard: Guard) -> float:

@@ -148,7 +148,7 @@ def _find(image: Image, search: Search, expected: list[Expected], line: float, p
     found = find_circles(
         image,
         base.camera,
-        base.T_camera_table,
+        base.table_frame,
         expected,
         search_m=search.radius,
         line_m=line,

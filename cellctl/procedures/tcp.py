@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.calib import tcp
-from cellctl.calib.tcp import TcpResult
+from cellctl.calib.tcp import PivotResult
 from cellctl.cell import Cell
 from cellctl.errors import BadInput
 from cellctl.geometry import Transform
@@ -22,12 +22,12 @@ TAKEN = "the tip is on the point"
 
 
 class TcpParams(BaseModel):
-    """`poses` with the tip on the point; `max_residual_mm` is what they may disagree by."""
+    """`poses` with the tip on the point; `max_held_out_mm` is what they may disagree by."""
 
     model_config = ConfigDict(extra="forbid")
 
     poses: int = Field(default=6, ge=4, le=50)
-    max_residual_mm: float = Field(default=1.0, gt=0)
+    max_held_out_mm: float = Field(default=1.0, gt=0)
 
 
 async def collect(run: Run, cell: Cell, params: TcpParams) -> None:
@@ -58,11 +58,11 @@ async def collect(run: Run, cell: Cell, params: TcpParams) -> None:
         )
 
 
-def solve(record: Record[TcpParams]) -> TcpResult:
+def solve(record: Record[TcpParams]) -> PivotResult:
     """Pure: the tip from the recorded poses."""
     samples = sorted(record.samples(POSES).items())
     poses = np.array([_pose(sample) for _, sample in samples]).reshape(-1, 4, 4)
-    return tcp.solve_tcp(poses, ids=[key for key, _ in samples])
+    return tcp.solve_tip(poses, ids=[key for key, _ in samples])
 
 
 def _pose(sample: Sample) -> Any:
@@ -75,7 +75,7 @@ def _pose(sample: Sample) -> Any:
 def conclude(record: Record[TcpParams]) -> Result:
     """Pure: from what was recorded to the tip, beside what the config says."""
     result = solve(record)
-    limits = tcp.TcpLimits(residual_mm=record.params.max_residual_mm)
+    limits = tcp.PivotLimits(held_out_mm=record.params.max_held_out_mm)
     _, reasons = tcp.judge(result, limits)
     stated = np.array(record.config.bracket.pen.tip_m)
     data = {

@@ -20,7 +20,7 @@ from cellctl.store.sheets import Spot
 CONFIG = parse_config(cell_document(PRESETS["cr"], 0), "test")
 GUARD = guard_of(CONFIG)
 TILTED = Plane(np.array([0.0, -0.44, 0.0005]), np.array([0.002, -0.001, 1.0]) / np.sqrt(1 + 5e-6))
-RIG = pen.pen_rig(CONFIG, GUARD, TILTED, np.zeros(6))
+RIG = pen.pen_rig(CONFIG, GUARD, TILTED, TILTED.normal, np.zeros(6))
 CENTRE = np.array([0.2, -0.5])
 RADIUS = 0.01
 
