@@ -73,10 +73,11 @@ def main() -> None:
     parser.add_argument("--kernels", action="store_true", help="all families")
     options = parser.parse_args()
     families = [family.name for family in FAMILIES] if options.kernels else PLAIN
-    found = [
-        world(seed, families, solved=options.solved, preset=options.preset)
-        for seed in range(options.worlds)
-    ]
+    found = []
+    for seed in range(options.worlds):
+        found.append(world(seed, families, solved=options.solved, preset=options.preset))
+        covered = [int(found[-1][f"{name}_covered"]) for name in ("refined", "base")]
+        print(f"seed {seed}: true {found[-1]['chosen']:.3f} mm, covered {covered}", flush=True)
     for name in found[0]:
         values = np.array([figures[name] for figures in found])
         if name.endswith("_covered"):
