@@ -275,7 +275,7 @@ class _Parameters:
     def values(self, start: Fit | None) -> Array:
         """Those of a fit before, as far as it goes; or of the identity."""
         of_H, count = self.family.entries.shape[1], 2 * self.family.monomials
-        values = np.zeros(of_H + count + 2 * self._ridge.shape[1])
+        values = np.zeros(of_H + count + self._of_kernel)
         if start is not None:
             moved = (start.refinement.H - np.eye(3)).reshape(9)[:8]
             values[:of_H] = np.linalg.lstsq(self.family.entries, moved, rcond=None)[0]
@@ -284,8 +284,8 @@ class _Parameters:
         return values
 
     @property
-    def _ridge(self) -> Array:
-        return np.zeros((0, 0)) if self.smooth is None else self.smooth.weights
+    def _of_kernel(self) -> int:
+        return 0 if self.smooth is None else 2 * self.smooth.weights.shape[1]
 
     def refinement(self, values: Array) -> Refinement:
         of_H, count = self.family.entries.shape[1], 2 * self.family.monomials
@@ -314,8 +314,7 @@ class _Parameters:
         """Diagonal (p + 2,) and gradient of what is known beforehand, in square millimetres."""
         diagonal = np.zeros(len(values) + 2)
         if self.smooth is not None:
-            ridge = 2 * self.smooth.weights.shape[1]
-            diagonal[-2 - ridge : -2] = self.smooth.ridge * self.frame.mm**2
+            diagonal[-2 - self._of_kernel : -2] = self.smooth.ridge * self.frame.mm**2
         if self.family.known:
             diagonal[: self.family.entries.shape[1]] = MARK_SIGMA_MM**2
         diagonal[-2:] = (MARK_SIGMA_MM / TCP_PRIOR_MM) ** 2

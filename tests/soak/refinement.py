@@ -14,6 +14,7 @@ from cellctl.calib.evaluate import Evaluation, evaluate
 from cellctl.calib.refine import solve_refine
 from cellctl.calib.refine_fit import FAMILIES, Marks
 from cellctl.calib.refine_result import RefineResult
+from cellctl.sim.presets import PRESETS
 from tests.calib.drawn import DETECTION_PX, DrawnCell, layout, quick_cell, solved_cell
 
 PLAIN = ("none", "shift", "similarity", "affine", "projective", "quadratic")
@@ -68,15 +69,16 @@ def world(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=200)
-    parser.add_argument("--preset", default="cr", choices=("cr", "ir"))
+    parser.add_argument("--preset", default="cr", choices=sorted(PRESETS))
     parser.add_argument("--solved", action="store_true", help="solve the base calibration too")
     parser.add_argument("--kernels", action="store_true", help="all families")
     options = parser.parse_args()
     families = [family.name for family in FAMILIES] if options.kernels else PLAIN
-    found = [
-        world(seed, families, solved=options.solved, preset=options.preset)
-        for seed in range(options.worlds)
-    ]
+    found = []
+    for seed in range(options.worlds):
+        found.append(world(seed, families, solved=options.solved, preset=options.preset))
+        covered = [int(found[-1][f"{name}_covered"]) for name in ("refined", "base")]
+        print(f"seed {seed}: true {found[-1]['chosen']:.3f} mm, covered {covered}", flush=True)
     for name in found[0]:
         values = np.array([figures[name] for figures in found])
         if name.endswith("_covered"):
