@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtri, gammaincinv
 
 from cellctl.calib.views import rms
 from cellctl.errors import SolveError
@@ -114,7 +114,7 @@ def interval(
     """
     tail = (1.0 - rate) / 2.0
     ratio = total**2 / 2.0 / max(sigma, 1e-12) ** 2
-    excess = ratio / stats.f.isf(tail, 2 * count, max(freedom, 1.0)) - 1.0
+    excess = ratio / fdtri(2 * count, max(freedom, 1.0), 1.0 - tail) - 1.0
     low = sigma * np.sqrt(2.0 * max(excess, 0.0))
-    high = total * np.sqrt(2 * count / stats.chi2.ppf(tail, 2 * count))
+    high = total * np.sqrt(2 * count / (2.0 * gammaincinv(count, tail)))
     return float(low), float(high)

@@ -13,9 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import minimize
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-from sklearn.linear_model import RidgeCV
 
 from cellctl.calib.refinement import kernel_values
 from cellctl.geometry import Array
@@ -74,6 +71,8 @@ def _cross_validated(phi: Array, u: Array, left: Array) -> float:
     """The ridge. The trend is fitted along, its columns too long for the ridge to shorten."""
     trend = np.column_stack([np.ones(len(u)), u])
     columns = np.column_stack([FREE * trend, phi])
+    from sklearn.linear_model import RidgeCV  # noqa: PLC0415 - seconds, and rarely needed
+
     found = RidgeCV(RIDGES, fit_intercept=False).fit(columns, left / max(left.std(), 1e-12))
     return float(found.alpha_)
 
@@ -84,6 +83,13 @@ def _most_likely(u: Array, left: Array, theta: Array | None) -> Array:
     Optimised here, not by scikit-learn, which warns when an optimum lies on a bound: that is an
     answer too, namely that there is nothing but noise.
     """
+    from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415 - as above
+    from sklearn.gaussian_process.kernels import (  # noqa: PLC0415
+        RBF,
+        ConstantKernel,
+        WhiteKernel,
+    )
+
     kernel = ConstantKernel(1.0, SIGNAL) * RBF(1.0, LENGTHS) + WhiteKernel(0.5, NOISE)
     process = GaussianProcessRegressor(kernel, optimizer=None)
     process.fit(u, left / max(left.std(), 1e-12))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy.special import ndtri, stdtrit
 
 from cellctl.calib.plane import Plane
 from cellctl.calib.views import Rejection
@@ -183,7 +183,7 @@ def _interval(spare: int, places: int = 1) -> float:
     """Half the 95 % interval in standard deviations, for so many places at once, when these come
     from `spare` residuals; from none, they are an opinion and taken as certain."""
     tail = 0.025 / places
-    return float(stats.t.isf(tail, spare) if spare > 0 else stats.norm.isf(tail))
+    return float(stdtrit(spare, 1.0 - tail) if spare > 0 else -ndtri(tail))
 
 
 def _read(value: dict[str, Any]) -> TableSurface:

@@ -143,12 +143,12 @@ def _ink(record: Record[FullParams], base: Calibration) -> Ink:
     found = draw.seen(record.scoped(DRAW, record.params.draw), base)
     faults = drawn.faults(found, base)
     marks = found.marks(base.camera)
-    refusals = refine.slipped(marks, base)
+    slips = refine.slipped(marks, base)
     try:
         result = refine.solve(marks, base)
     except SolveError as error:
-        return Ink(found, faults, refusals or [error.message], None)
-    return Ink(found, faults, refusals + refine.judge(result, record.params.refine), result)
+        return Ink(found, faults, slips or [error.message], None)
+    return Ink(found, faults, refine.judge(result, record.params.refine, slips), result)
 
 
 def conclude(record: Record[FullParams]) -> Result:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.calib import marks, refine
@@ -39,7 +40,9 @@ class RefineParams(BaseModel):
 def solve(circles: list[Mark], base: Calibration) -> RefineResult:
     """Pure: the correction and the pen's offset. SolveError when the circles contradict each
     other."""
-    return refine.solve_refine(circles, base)
+    covariance = base.quality.get("hand_eye_covariance")
+    pose = None if covariance is None else np.array(covariance)[:6, :6]
+    return refine.solve_refine(circles, base, pose_covariance=pose)
 
 
 def slipped(circles: list[Mark], base: Calibration) -> list[str]:
@@ -47,11 +50,13 @@ def slipped(circles: list[Mark], base: Calibration) -> list[str]:
     return list(marks.slip_reasons(marks.slips(circles, base)))
 
 
-def judge(result: RefineResult, params: RefineParams) -> list[str]:
-    """Why it fails; empty when it passes."""
-    reasons = list(
-        marks.tcp_reasons(result.tcp_mm, result.tcp_covariance_mm2, params.max_tcp_off_mm)
-    )
+def judge(result: RefineResult, params: RefineParams, slips: list[str]) -> list[str]:
+    """Why it fails; empty when it passes. A pen that slipped (`slips`) looks like one that stands
+    off, and is not blamed for both."""
+    reasons = list(slips)
+    if not slips:
+        limit = params.max_tcp_off_mm
+        reasons += marks.tcp_reasons(result.tcp_mm, result.tcp_covariance_mm2, limit)
     error = result.errors["leave_one_out"].mm
     if not error <= params.max_held_out_mm:
         reasons.append(
@@ -135,7 +140,7 @@ def conclude(record: Record[RefineParams]) -> Result:
     base = active_of(record.active)
     circles = _marks(record, base)
     result = solve(circles, base)
-    reasons = slipped(circles, base) + judge(result, record.params)
+    reasons = judge(result, record.params, slipped(circles, base))
     data = {"kind": "refine", **result_data(result)}
     return Result.judged(reasons, data, refined(base, result).to_dict())
 
