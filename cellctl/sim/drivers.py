@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -85,14 +86,7 @@ class SimRobot:
         `timeout_s` is cell time, and real time on top of what one answer may take. DeviceFault
         on a protective stop, a lost link, a timeout, or when the arm rests somewhere else.
         """
-        config = self._config
-        state = await self._carry_out(
-            "robot.move",
-            timeout_s,
-            waypoints=target.path.waypoints.tolist(),
-            joint_speed_rad_s=np.radians(config.joint_speed_deg_s) * target.speed,
-            tool_speed_m_s=config.tcp_speed_m_s,
-        )
+        state = await self._carried_out(partial(self._start, target), timeout_s)
         _check_goal(state, target.path.waypoints[-1])
         return state
 
@@ -127,22 +121,14 @@ class SimRobot:
         await self._link.close()
 
     async def _follow(self, verb: str, stroke: Stroke, timeout_s: float) -> RobotState:
-        config = self._config
-        return await self._carry_out(
-            verb,
-            timeout_s,
-            joints=stroke.joints.tolist(),
-            speed_m_s=min(stroke.speed_m_s, config.tcp_speed_m_s),
-            joint_speed_rad_s=np.radians(config.joint_speed_deg_s),
-        )
+        return await self._carried_out(partial(self._start_stroke, verb, stroke), timeout_s)
 
-    async def _carry_out(self, verb: str, timeout_s: float, **arguments: Any) -> RobotState:
+    async def _carried_out(
+        self, start: Callable[[], Awaitable[None]], timeout_s: float
+    ) -> RobotState:
         """Start a motion and wait for its end; cancelled or too late, the arm has been stopped."""
-        acceleration = np.radians(self._config.joint_acceleration_deg_s2)
         try:
-            await self._link.request(
-                verb, joint_acceleration_rad_s2=acceleration, **arguments, **self._tally.next()
-            )
+            await start()
             return await self._settled(timeout_s)
         except asyncio.CancelledError:
             await _finished(self.stop(clean=True))
@@ -150,6 +136,28 @@ class SimRobot:
         except TimeoutError as error:
             await self.stop(clean=True)
             raise DeviceFault(f"robot: {error}; the arm was stopped") from None
+
+    async def _start(self, target: Target) -> None:
+        config = self._config
+        await self._link.request(
+            "robot.move",
+            waypoints=target.path.waypoints.tolist(),
+            joint_speed_rad_s=np.radians(config.joint_speed_deg_s) * target.speed,
+            joint_acceleration_rad_s2=np.radians(config.joint_acceleration_deg_s2),
+            tool_speed_m_s=config.tcp_speed_m_s,
+            **self._tally.next(),
+        )
+
+    async def _start_stroke(self, verb: str, stroke: Stroke) -> None:
+        config = self._config
+        await self._link.request(
+            verb,
+            joints=stroke.joints.tolist(),
+            speed_m_s=min(stroke.speed_m_s, config.tcp_speed_m_s),
+            joint_speed_rad_s=np.radians(config.joint_speed_deg_s),
+            joint_acceleration_rad_s2=np.radians(config.joint_acceleration_deg_s2),
+            **self._tally.next(),
+        )
 
     async def _settled(self, timeout_s: float, *, faults: bool = True) -> RobotState:
         """Wait for standstill, in slices; DeviceFault on a fault, TimeoutError when too late."""

@@ -31,6 +31,8 @@ SETTLE_RAD, SETTLE_S = 1e-4, 0.016
 """A move to where the arm already is takes this long: brakes and servo settle anew."""
 TICK_S = 0.008
 """The controller measures at 125 Hz."""
+STILL_TICKS = 16
+"""So many at a time are looked at for the last motion."""
 
 
 class Course:
@@ -194,10 +196,12 @@ class Motion:
         """For how long, at this tick, all reported joint speeds have been zero."""
         for leg in reversed([leg for leg in self._legs if leg.t0 <= tick * TICK_S]):
             newest = min(tick, int(np.ceil((leg.end + RING_S) / TICK_S)))
-            ticks = np.arange(int(np.floor(leg.t0 / TICK_S)), newest + 1)
-            moving = ticks[self.encoders(ticks * TICK_S)[1].any(axis=1)]
-            if len(moving):
-                return float((tick - moving[-1]) * TICK_S)
+            oldest = int(np.floor(leg.t0 / TICK_S))
+            for last in range(newest, oldest - 1, -STILL_TICKS):  # the newest ones mostly tell
+                ticks = np.arange(max(oldest, last + 1 - STILL_TICKS), last + 1)
+                moving = ticks[self.encoders(ticks * TICK_S)[1].any(axis=1)]
+                if len(moving):
+                    return float((tick - moving[-1]) * TICK_S)
         return tick * TICK_S - self._legs[0].t0
 
     def frames(self, t: Array) -> Array:

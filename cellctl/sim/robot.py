@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -181,8 +181,8 @@ class Arm:
     def read(self, now: float) -> Reading:
         """The newest measurement at `now`. No standstill while a commanded motion is under way,
         even if nothing has been measured of it yet."""
-        reading = self._reading(int(np.floor(now / TICK_S + 1e-6)), now)
-        return replace(reading, standstill_s=0.0) if now < self.moving_until() else reading
+        moving = now < self.moving_until()
+        return self._reading(int(np.floor(now / TICK_S + 1e-6)), now, moving=moving)
 
     def read_at(self, t: float, now: float) -> Reading:
         """Interpolated between measurements; DeviceFault when `t` is not covered."""
@@ -209,11 +209,12 @@ class Arm:
     def forget(self, before: float) -> None:
         self._motion.forget(before)
 
-    def _reading(self, tick: int, now: float) -> Reading:
+    def _reading(self, tick: int, now: float, *, moving: bool = False) -> Reading:
         t = tick * TICK_S
         joints, speeds = (a[0] for a in self._motion.encoders(np.array([t])))
         flange = self._truth.nominal_arm.forward(joints)
-        return Reading(t, joints, speeds, flange, self._motion.standstill_s(tick), self.fault(now))
+        still = 0.0 if moving else self._motion.standstill_s(tick)
+        return Reading(t, joints, speeds, flange, still, self.fault(now))
 
     def _ready(self, now: float, waypoints: Array) -> None:
         """DeviceFault or MotionRefused when no motion through `waypoints` may start."""

@@ -11,7 +11,7 @@ from cellctl.drivers.base import SAMPLE, Stroke
 from cellctl.errors import BadInput, DeviceFault, MotionRefused, NotFound
 from cellctl.sim.drivers import GOAL_RAD, STANDSTILL_S, SimRobot
 from cellctl.sim.grid import touched_height
-from cellctl.sim.link import SimClock
+from cellctl.sim.link import Link, SimClock
 from cellctl.sim.presets import CR
 from cellctl.sim.truth import draw
 from tests.sim.strokes import RADIUS_M, SPOT, circle_tips, joints_at, tips_of
@@ -173,8 +173,10 @@ async def test_half_a_circle_is_left_when_the_daemon_goes(paced, how):
         await cell.faults.plant("sheet.replace")
         await cell.robot.move(to(CIRCLE[0]), timeout_s=30)
         drawing = asyncio.create_task(cell.robot.draw(stroke(speed=0.03), timeout_s=60))
+        link = Link("watcher", paced.cell)
         while not any(part["length_m"] > 0.02 for part in await cell.scorer.ink()):
-            await asyncio.sleep(0.02)
+            await link.request("wait", seconds=0.05)
+        await link.close()
         if how == "cancelled":
             drawing.cancel()
             with pytest.raises(asyncio.CancelledError):

@@ -215,11 +215,11 @@ def test_it_says_ready_once_idles_out_and_leaves_no_file(tmp_path):
 
 
 async def test_a_connection_keeps_it_alive_and_sigterm_ends_it(tmp_path):
-    section = SimulationSection(preset="cr", idle_exit_s=0.5)
+    section = SimulationSection(preset="cr", idle_exit_s=2.0)
     running = await asyncio.to_thread(connect_or_start, section, tmp_path)
     link = Link("holder", running.cell)
     await link.request("hello")
-    await asyncio.sleep(1.0)
+    await asyncio.sleep(2.5)
     await link.request("hello")
     assert await asyncio.to_thread(stop_world, tmp_path)  # although somebody is connected
     with pytest.raises(DeviceFault, match=r"lost|does not answer"):
