@@ -131,8 +131,11 @@ async def look(cell: Cell, board: Board, image: Image) -> Detection | Unseen:
 
 def mean_image(frames: list[Frame]) -> Image:
     """The mean of pictures of one still scene, rounded to grey levels."""
-    stack = np.stack([frame.image for frame in frames])
-    return np.rint(stack.mean(axis=0, dtype=np.float32)).astype(np.uint8)
+    total = frames[0].image.astype(np.float32)
+    for frame in frames[1:]:
+        cv2.accumulate(frame.image, total)
+    total /= len(frames)
+    return np.rint(total, out=total).astype(np.uint8)
 
 
 def shift_px(a: Detection, b: Detection) -> float:

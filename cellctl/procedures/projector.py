@@ -124,20 +124,31 @@ def journalled(sample: Sample) -> Markers:
 def seen(record: Record[ProjectorParams]) -> Shown:
     """What was recorded; without a look before, the first picture is compared with the last."""
     shown = pictures_of(record.config, record.params)
-    pictures = _found(record, PICTURES)
+    pictures = _found(record, PICTURES, shown)
     return Shown(
         pictures=pictures,
         centres={number: c for pattern in shown for number, c in pattern.centres.items()},
-        before=(_found(record, BEFORE) or pictures)[0],
-        again=_found(record, AGAIN)[0],
+        before=(_found(record, BEFORE, shown) or pictures)[0],
+        again=_found(record, AGAIN, shown)[0],
     )
 
 
-def _found(record: Record[ProjectorParams], step: str) -> list[Markers]:
+def _found(
+    record: Record[ProjectorParams], step: str, shown: list[patterns.MarkerPicture]
+) -> list[Markers]:
+    """What was found, in each picture that was taken, of what was shown there: a marker of
+    another picture's is something else, such as print that looks like one."""
+    samples = record.samples(step)
+    taken = [(pattern, samples.get(f"picture-{i}")) for i, pattern in enumerate(shown)]
     return [
-        patterns.detect_markers(picture(sample)) if record.again else journalled(sample)
-        for _, sample in sorted(record.samples(step).items())
+        {n: c for n, c in _markers_in(sample, again=record.again).items() if n in pattern.centres}
+        for pattern, sample in taken
+        if sample is not None
     ]
+
+
+def _markers_in(sample: Sample, *, again: bool) -> Markers:
+    return patterns.detect_markers(picture(sample)) if again else journalled(sample)
 
 
 def solve(shown: Shown, camera: CameraModel, lens: LensPrior) -> ProjectorResult:

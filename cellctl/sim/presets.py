@@ -110,6 +110,7 @@ class BoardPreset:
     tray_m: float
     pen_m: float
     forwards: bool = False
+    dictionary: str = "DICT_4X4_50"
     scale_off: tuple[float, float] = (0.001, 0.005)
     bend_m: float = 0.3e-3
 
@@ -198,6 +199,7 @@ IR = Preset(
         tray_m=0.20,
         pen_m=0.30,
         forwards=True,
+        dictionary="DICT_5X5_50",  # the camera sees the parked board beside the projected markers
     ),
     fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.7)),
 )

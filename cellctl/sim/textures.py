@@ -16,8 +16,6 @@ from cellctl.geometry import Array
 from cellctl.sim.presets import BoardPreset
 
 INK, PAPER = 0.05, 0.85
-DICTIONARY = "DICT_4X4_50"
-CELLS = 6  # of a 4x4 marker with its black border
 LEVELS = 5
 CELL_TEXELS = {"checkerboard": 160, "markers": 40}  # of a square, of a marker's cell
 
@@ -66,7 +64,7 @@ def description(name: str, preset: BoardPreset) -> dict[str, object]:
         "markers": list(preset.markers),
         "marker_m": preset.marker_m,
         "pitch_m": preset.pitch_m,
-        "dictionary": DICTIONARY,
+        "dictionary": preset.dictionary,
         "first_id": 0,
     }
 
@@ -102,14 +100,15 @@ def _checkerboard(preset: BoardPreset) -> tuple[Array, Array, float]:
 def _markers(preset: BoardPreset) -> tuple[Array, Array, float]:
     """As `_checkerboard`: markers row-major from the first one's first corner at the origin."""
     columns, rows = preset.markers
-    texel = preset.marker_m / (CELLS * CELL_TEXELS["markers"])
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, preset.dictionary))
+    modules = dictionary.markerSize + 2  # with the black border
+    side = modules * CELL_TEXELS["markers"]
+    texel = preset.marker_m / side
     pitch, gap = (_texels(m, texel) for m in (preset.pitch_m, preset.pitch_m - preset.marker_m))
-    side = CELLS * CELL_TEXELS["markers"]
     ink = np.zeros((rows * pitch + gap, columns * pitch + gap), dtype=bool)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
     for marker in range(columns * rows):
         top, left = (gap + pitch * i for i in divmod(marker, columns))
-        cells = dictionary.generateImageMarker(marker, CELLS) == 0
+        cells = dictionary.generateImageMarker(marker, modules) == 0
         fine = CELL_TEXELS["markers"]
         ink[top : top + side, left : left + side] = cells.repeat(fine, 0).repeat(fine, 1)
     return ink, np.array([-gap, -gap]) * texel, texel

@@ -11,7 +11,7 @@ import pytest
 from cellctl.geometry import Transform, rotation_angle
 from cellctl.sim.cell_config import cell_document
 from cellctl.sim.grid import touched_height
-from cellctl.sim.presets import CR
+from cellctl.sim.presets import CR, IR
 from cellctl.sim.truth import draw
 
 PINNED = [
@@ -76,6 +76,27 @@ PINNED = [
     ("tape_off_m", 0.10),
     ("tape_off_deg", 10.0),
 ]
+LARGE = dict(PINNED) | {
+    "arm": "irb4600-60/2.05",
+    "arm_errors.zero_sigma_deg": 0.02,
+    "arm_errors.length_sigma_m": 0.25e-3,
+    "camera.size_px": (3840, 2160),
+    "camera.focal_px": (1830.0, 1828.0),
+    "camera.centre_px": (1916.0, 1096.0),
+    "camera.pixel_sigma": 6.0,
+    "camera.factory_centre_off_px": 4.0,
+    "camera.height_m": 4.0,
+    "camera.tilt_deg": (6.0, 4.0),
+    "projector.throw_ratio": 1.40,
+    "projector.distance_m": 3.3,
+    "table.centre_m": (1.3, 0.0, 0.6),
+    "table.area_m": (0.750, 1.100),
+    "boards.square_m": 0.060,
+    "boards.markers": (3, 5),
+    "boards.marker_m": 0.080,
+    "boards.pitch_m": 0.100,
+}
+"""What the large cell has; everything else as in the small one."""
 SEEDS = 300
 
 
@@ -84,12 +105,36 @@ def truths():
     return [draw(CR, seed) for seed in range(SEEDS)]
 
 
+def found(preset, name):
+    for part in name.split("."):
+        preset = getattr(preset, part)
+    return preset
+
+
 @pytest.mark.parametrize(("name", "value"), PINNED, ids=[name for name, _ in PINNED])
 def test_pinned(name, value):
-    found = CR
-    for part in name.split("."):
-        found = getattr(found, part)
-    assert found == value
+    assert found(CR, name) == value
+
+
+@pytest.mark.parametrize(("name", "value"), LARGE.items(), ids=LARGE.keys())
+def test_the_large_cell_is_pinned(name, value):
+    assert found(IR, name) == value
+
+
+def test_the_large_cells_light_lies_along_the_table():
+    """Its long side along y, 1.24 mm a pixel, over all that is drawn in, and not beside the table."""
+    for seed in range(20):
+        truth = draw(IR, seed)
+        corners = truth.light_lands(np.array([(0, 0), (1919, 0), (1919, 1079), (0, 1079)]))
+        low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+        centre, half = np.array(IR.table.centre_m[:2]), np.array(IR.table.area_m) / 2
+        assert (low < centre - 1.1 * half).all()
+        assert (high > centre + 1.1 * half).all()
+        assert (np.abs(corners[:, :2] - centre) < np.array(IR.table.top_m) / 2).all()
+        middle = truth.light_lands(np.array([[959.5, 539.5], [960.5, 539.5]]))
+        assert np.linalg.norm(middle[0] - IR.table.centre_m) < 3e-3
+        assert np.linalg.norm(middle[1] - middle[0]) == pytest.approx(1.24e-3, rel=0.05)
+        assert np.abs((middle[1] - middle[0])[1]) > 1.1e-3
 
 
 def test_same_seed_same_cell(truths):
