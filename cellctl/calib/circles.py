@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.plane_view import PlaneView, flatten
 from cellctl.calib.printed import Unseen
-from cellctl.calib.ring_fit import Picture, Rings, fit_rings
+from cellctl.calib.ring_fit import Picture, Rings, fit_rings, line_sigma, seen_sigma
 from cellctl.calib.ring_match import match_rings
 from cellctl.calib.ring_votes import Candidates, thin_lines, vote
 from cellctl.errors import BadInput, SolveError
@@ -41,6 +41,7 @@ ROUND_PX = 0.3
 tremor is a tenth of a pixel, and so is the plane's tilt when it is wrong by 10 degrees."""
 SAME_PX = 2.0
 LEAST_RADIUS_PX = 3.0
+ANGLES = (64, 160)
 COARSE_ANGLES, COARSE_WIDTHS = 36, (1.15, 1.0, 1.0)
 SATURATED = 249.0
 LEAST_NOISE = 0.3
@@ -114,11 +115,7 @@ def find_circles(
     if len(visible):
         wanted = _Wanted(centres[visible], radii[visible], search_m, line_m)
         rings = _rings(picture, view, wanted)
-        whole = _whole(rings)
-        chosen = match_rings(
-            wanted.centres, wanted.radii, rings.centres, rings.radii, whole, search_m
-        )
-        for i, ring in zip(visible, chosen, strict=True):
+        for i, ring in zip(visible, _matched(wanted, rings), strict=True):
             answer[keys[i]] = _answer(rings, int(ring), view)
     return answer
 
@@ -137,25 +134,32 @@ class _Wanted:
     line_m: float
 
 
+def _matched(wanted: _Wanted, rings: Rings) -> Array:
+    """(n,) the number of each expected circle's ring, or -1."""
+    return match_rings(
+        wanted.centres, wanted.radii, rings.centres, rings.radii, _whole(rings), wanted.search_m
+    )
+
+
 def _rings(picture: Picture, view: PlaneView, wanted: _Wanted) -> Rings:
     """Every ring near an expected one, fitted; also unfinished ones."""
     candidates = _candidates(picture, view, wanted)
-    pixel_m = view.pixel_m(candidates.centres)
-    known = np.isfinite(pixel_m)
-    candidates, pixel_m = candidates[known], pixel_m[known]
+    candidates = candidates[np.isfinite(view.pixel_m(candidates.centres))]
+    pixel_m = float(np.median(view.pixel_m(wanted.centres)))
+    sigma = line_sigma(wanted.line_m, pixel_m)
     coarse = fit_rings(
         picture,
         view,
         candidates.centres,
         candidates.radii,
-        wanted.line_m,
+        sigma,
         angles=COARSE_ANGLES,
         widths=COARSE_WIDTHS,
     )
     coarse = coarse[_distinct(coarse, view, coarse.ink > HALF / 2)]
-    circumference = 2.0 * np.pi * np.median(wanted.radii) / np.median(view.pixel_m(wanted.centres))
-    angles = int(np.clip(circumference, 64, 160))
-    fine = fit_rings(picture, view, coarse.centres, coarse.radii, wanted.line_m, angles=angles)
+    sigma = seen_sigma(picture, view, coarse, sigma)
+    angles = int(np.clip(2.0 * np.pi * np.median(wanted.radii) / pixel_m, *ANGLES))
+    fine = fit_rings(picture, view, coarse.centres, coarse.radii, sigma, angles=angles)
     allowed = ROUND_PX + picture.noise / np.maximum(fine.depth, picture.noise)
     sound = (fine.rms_px < allowed) & (fine.ink > HALF / 2)
     return fine[_distinct(fine, view, sound)]

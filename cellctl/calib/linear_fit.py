@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import fdtri
 
 from cellctl.errors import SolveError
 from cellctl.geometry import Array
@@ -86,7 +86,7 @@ class LinearFit:
             return None
         rest = max(self.sum_of_squares - float(drop[worst]), 0.0)
         variance = (rest + noise.weight * noise.sigma**2) / spare
-        limit = stats.f.isf(PROBABILITY / n, b, spare)
+        limit = fdtri(b, spare, 1.0 - PROBABILITY / n)
         return worst if drop[worst] / b > limit * variance else None
 
 

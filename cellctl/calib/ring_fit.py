@@ -18,6 +18,8 @@ from cellctl.geometry import Array, Mask
 
 BLUR_PX = 0.75
 """What a lens and a pixel's own width add to a line, standard deviation."""
+OTHER_WIDTHS = (0.8, 1.0, 1.25, 1.6, 2.0, 2.5)
+"""Lines may be that many times as wide as expected."""
 STEP_PX = 0.5
 SIDE = 1.7
 """The line's sides begin that many standard deviations off it."""
@@ -93,26 +95,49 @@ class _Profiles:
     blind: Mask
 
 
+def line_sigma(line_m: float, pixel_m: float) -> float:
+    """Standard deviation, pixels, of the bell that a line in focus makes."""
+    return float(np.hypot(line_m / pixel_m / np.sqrt(12.0), BLUR_PX))
+
+
+def seen_sigma(picture: Picture, view: PlaneView, rings: Rings, sigma: float) -> float:
+    """The same as fitted rings show it: that of the bell most like the median profile, near what
+    was expected, `sigma`. A lens out of focus or a worn pen makes wider lines."""
+    clear = rings[np.flatnonzero(rings.ink > 0.5)]
+    if not len(clear):
+        return sigma
+    pixel_m = view.pixel_m(clear.centres)
+    reach = REACH * OTHER_WIDTHS[-2] * sigma
+    t = np.arange(-np.ceil(reach / STEP_PX), np.ceil(reach / STEP_PX) + 1) * STEP_PX
+    values, _ = _across(picture, view, clear, _spokes(36), pixel_m, t)
+    profile = np.median(values - np.median(values, axis=2, keepdims=True), axis=(0, 1))
+    left = []
+    for width in OTHER_WIDTHS:
+        bell = np.stack([np.ones_like(t), t, np.exp(-0.5 * np.square(t / width / sigma))], axis=-1)
+        left.append(float(np.linalg.norm(profile - bell @ (np.linalg.pinv(bell) @ profile))))
+    return sigma * OTHER_WIDTHS[int(np.argmin(left))]
+
+
 def fit_rings(
     picture: Picture,
     view: PlaneView,
     centres: Array,
     radii: Array,
-    line_m: float,
+    sigma: float,
     *,
     angles: int,
     widths: tuple[float, ...] = WIDTHS,
 ) -> Rings:
-    """Rings fitted from starts `centres` (n, 2), `radii` (n,), right to about two pixels."""
+    """Rings fitted from starts `centres` (n, 2), `radii` (n,), right to about a pixel or two;
+    `sigma` is the line's, pixels."""
     if not len(radii):
         return Rings(centres, *np.zeros((7, 0)))
-    theta = 2.0 * np.pi * np.arange(angles) / angles
-    spokes = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    spokes = _spokes(angles)
     design = np.column_stack([spokes, np.ones(angles)])
     pixel_m = view.pixel_m(centres)
     for width in widths:
-        sigma = width * np.hypot(line_m / pixel_m / np.sqrt(12.0), BLUR_PX)
-        profiles = _profiles(picture, view, centres, radii, spokes, pixel_m, sigma)
+        start = _Start(centres, radii)
+        profiles = _profiles(picture, view, start, spokes, pixel_m, width * sigma)
         inked = _inked(profiles, picture.noise, OFF_PX * width)
         weights = _weights(profiles.off, inked, design)
         step = np.clip(_solve(design, weights, profiles.off), -2.0, 2.0) * pixel_m[:, None]
@@ -120,33 +145,55 @@ def fit_rings(
     return _measured(profiles, inked, weights, design, centres, radii, pixel_m)
 
 
+@dataclass(frozen=True, eq=False)
+class _Start:
+    centres: Array
+    radii: Array
+
+
+def _spokes(angles: int) -> Array:
+    """(k, 2) directions all around."""
+    theta = 2.0 * np.pi * np.arange(angles) / angles
+    return np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+
+
 def _profiles(
     picture: Picture,
     view: PlaneView,
-    centres: Array,
-    radii: Array,
+    start: _Start,
     spokes: Array,
     pixel_m: Array,
-    sigma: Array,
+    sigma: float,
 ) -> _Profiles:
     """The line along every spoke, by least squares of a level, a slope, a bell and its shift."""
-    middle = float(np.median(sigma))
-    count = int(np.ceil(REACH * middle / STEP_PX))
+    count = int(np.ceil(REACH * sigma / STEP_PX))
     t = np.arange(-count, count + 1) * STEP_PX
-    on_line = centres[:, None] + radii[:, None, None] * spokes
-    outward = pixel_m[:, None, None, None] * t[[0, count, -1], None] * spokes[:, None]
-    ends = view.pixels(on_line[:, :, None] + outward)
-    pixels = _parabolas(t / t[-1]) @ ends
-    unseen = np.asarray(~view.inside(ends, 1.0).all(axis=-1))
-    pixels = np.nan_to_num(pixels)
-    values = np.asarray(sample(picture.values, pixels), dtype=float)
-    level, _, depth, shift = np.moveaxis(values @ _bell_solver(t, middle).T, -1, 0)
+    values, blind = _across(picture, view, start, spokes, pixel_m, t)
+    level, _, depth, shift = np.moveaxis(values @ _bell_solver(t, sigma).T, -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.where(depth > 0, shift / depth, np.nan)
+    dip = _dip(values, np.abs(t) <= OFF_PX, np.abs(t) >= SIDE * sigma)
+    return _Profiles(off, depth, dip, values[..., count], level, blind)
+
+
+def _across(
+    picture: Picture,
+    view: PlaneView,
+    rings: _Start | Rings,
+    spokes: Array,
+    pixel_m: Array,
+    t: Array,
+) -> tuple[Array, Mask]:
+    """Grey levels (n, k, t) at t (an odd number, symmetric) pixels outward of each ring along its
+    spokes (k, 2), and where (n, k) they cannot be told."""
+    on_line = rings.centres[:, None] + rings.radii[:, None, None] * spokes
+    outward = pixel_m[:, None, None, None] * t[[0, len(t) // 2, -1], None] * spokes[:, None]
+    ends = view.pixels(on_line[:, :, None] + outward)
+    pixels = np.nan_to_num(_parabolas(t / t[-1]) @ ends)
+    blind = np.asarray(~view.inside(ends, 1.0).all(axis=-1))
     if picture.blind is not None:
-        unseen |= sample(picture.blind, pixels[:, :, count]) > 0.25
-    dip = _dip(values, np.abs(t) <= OFF_PX, np.abs(t) >= SIDE * middle)
-    return _Profiles(off, depth, dip, values[..., count], level, unseen)
+        blind |= sample(picture.blind, pixels[:, :, len(t) // 2]) > 0.25
+    return np.asarray(sample(picture.values, pixels), dtype=float), blind
 
 
 def _dip(values: Array, on_line: Mask, beside: Mask) -> Array:
