@@ -44,7 +44,8 @@ class ReportWriter:
     async def close(self) -> None:
         """Give up what is not written yet; idempotent."""
         self._closed = True
-        if self._task is not None:
+        if self._task is not None and not self._task.done():
+            log.info("a report is given up; `cellctl report` writes it")
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._task
