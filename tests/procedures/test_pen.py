@@ -133,7 +133,10 @@ def test_the_tool_is_turned_at_least_three_ways(planned):
 
 
 def test_used_paper_is_left_alone(planned):
-    used = [("A", Spot(*map(float, s.xy), RADIUS, f"{i}")) for i, s in enumerate(planned[:40])]
+    used = [
+        ("A", Spot(float(s.xy[0]), float(s.xy[1]), RADIUS, f"{i}"))
+        for i, s in enumerate(planned[:40])
+    ]
     again = spots.plan_spots(RIG, CONFIG, used, 20, RADIUS, 0)
     old = np.array([spot.xy for spot in planned[:40]])
     new = np.array([spot.xy for spot in again])
