@@ -121,13 +121,12 @@ async def draw_round(
     """Draw a round from the spot number `place` on; the number of the next spot."""
     await run.step(CIRCLES, drawing.count * drawing.rounds)
     order = in_order(drawing.rig, spots, drawing.count)
-    hubs = np.array([spot.joints for spot in spots])
     good = 0
     while good < drawing.count:
         if place >= len(spots):
             raise SolveError(f"too many circles are void: the spots ran out in round {number + 1}")
         key = f"circle-{place:03}"
-        await _draw_once(run, cell, drawing, key, order[place], hubs, number)
+        await _draw_once(run, cell, drawing, key, order[place], number)
         good += run.samples()[key].data["state"] == "drawn"
         run.progress(sum(s.data["state"] == "drawn" for s in run.samples().values()))
         place += 1
@@ -135,7 +134,7 @@ async def draw_round(
 
 
 async def _draw_once(
-    run: Run, cell: Cell, drawing: Drawing, key: str, spot: PlannedSpot, hubs: Array, number: int
+    run: Run, cell: Cell, drawing: Drawing, key: str, spot: PlannedSpot, number: int
 ) -> None:
     """Draw the circle `key` and journal it. One that was begun before a crash is void; one that
     the guard refuses is journalled and passed over."""
@@ -149,7 +148,7 @@ async def _draw_once(
     async with run.taking(key):
         try:
             stroke, way = await pen_motion.over_circle(
-                run, cell, drawing.rig, spot, drawing.radius, drawing.speed_m_s, hubs
+                run, cell, drawing.rig, spot, drawing.radius, drawing.speed_m_s
             )
         except MotionRefused as refused:
             await run.sample(key, {**facts, "state": "void", "flaw": refused.message})

@@ -15,18 +15,19 @@ from cellctl.calib.calibration import Calibration
 from cellctl.calib.table_surface import Area, TableSurface
 from cellctl.cell import Cell
 from cellctl.drivers.base import RobotState
-from cellctl.errors import BadInput
+from cellctl.errors import BadInput, MotionRefused, SolveError
 from cellctl.geometry import Array, Transform
 from cellctl.procedures import paper, pen_motion
 from cellctl.procedures.knowledge import table_plane
 from cellctl.procedures.moving import posture
-from cellctl.procedures.pen import pen_rig
+from cellctl.procedures.pen import PenRig, pen_rig
 from cellctl.procedures.record import Record, recorded
 from cellctl.procedures.spots import PlannedSpot, area, in_order
 from cellctl.run import CANCEL, Procedure, Result, Run, StepCancelled
 from cellctl.store.history import Sample
 
 TOUCHES = "touches"
+FEWEST = 6
 DOT_M = 0.004
 """Paper that a touch takes, as a radius."""
 TOUCH_SPEED_M_S = 0.02
@@ -52,7 +53,6 @@ async def collect(run: Run, cell: Cell, params: MeasureTableParams) -> None:
     rig = pen_rig(cell.config, cell.guard, known, known.normal, await posture(run, cell))
     await run.step(TOUCHES, params.touches)
     spots = await paper.planned(run, cell, rig, params.touches, DOT_M, params.seed)
-    hubs = np.array([spot.joints for spot in spots])
     for i, spot in enumerate(in_order(rig, spots, params.touches)):
         done = sum("T_world_flange" in sample.data for sample in run.samples().values())
         run.progress(done)
@@ -64,18 +64,20 @@ async def collect(run: Run, cell: Cell, params: MeasureTableParams) -> None:
         elif key in run.samples():
             continue
         elif cell.config.bracket.pen.feels_contact:
-            await _feel(run, cell, rig, key, spot, hubs)
+            await _feel(run, cell, rig, key, spot)
         else:
             await _ask(run, cell, key, spot)
 
 
-async def _feel(run: Run, cell: Cell, rig: Any, key: str, spot: PlannedSpot, hubs: Array) -> None:
+async def _feel(run: Run, cell: Cell, rig: PenRig, key: str, spot: PlannedSpot) -> None:
     await run.checkpoint(f"the pen touches the table ({key})")
     below = DEEPEST * cell.config.bracket.pen.travel_m
     async with run.taking(key):
-        stroke, way = await pen_motion.over_touch(
-            run, cell, rig, spot, below, TOUCH_SPEED_M_S, hubs
-        )
+        try:
+            stroke, way = await pen_motion.over_touch(run, cell, rig, spot, below, TOUCH_SPEED_M_S)
+        except MotionRefused as refused:
+            await run.sample(key, {"flaw": refused.message, **spot.to_dict()})
+            return
         await paper.claim(run, cell, key, spot, DOT_M)
         state = await pen_motion.touch(run, cell, stroke)
     await paper.settle(run, cell, key, spot)
@@ -121,6 +123,11 @@ def solve(record: Record[MeasureTableParams]) -> TableSurface:
     touched = seen(record)
     low, high = area(record.config)
     points = np.array(list(touched.values())).reshape(-1, 3)
+    if len(points) < FEWEST:
+        flaws = [str(s.data["flaw"]) for s in record.samples(TOUCHES).values() if "flaw" in s.data]
+        raise SolveError(
+            f"only {len(points)} touches could be made, {FEWEST} are needed: {'; '.join(flaws[:2])}"
+        )
     return table.solve_table(points, ids=list(touched), area=Area(low, high))
 
 

@@ -8,7 +8,7 @@ from cellctl.cell import Cell
 from cellctl.drivers.base import Path, RobotState, Stroke, StrokeResult
 from cellctl.geometry import Array
 from cellctl.procedures import pen
-from cellctl.procedures.moving import go, lift_pen
+from cellctl.procedures.moving import go, gone, lift_pen
 from cellctl.procedures.pen import PenRig
 from cellctl.procedures.spots import PlannedSpot
 from cellctl.run import Run
@@ -23,12 +23,11 @@ async def over_circle(
     spot: PlannedSpot,
     radius: float,
     speed_m_s: float,
-    hubs: Array,
 ) -> tuple[Stroke, Path]:
     """Take the pen over the beginning of a circle of `radius` metres about a spot, if need be by
-    way of `hubs` (m, 6); the stroke that draws it, and the path. MotionRefused when none leads
-    there."""
-    return await _over(run, cell, rig, pen.circle(rig, spot.xy, radius), spot, speed_m_s, hubs)
+    way of where the arm has been in this run; the stroke that draws it, and the path.
+    MotionRefused when none leads there."""
+    return await _over(run, cell, rig, pen.circle(rig, spot.xy, radius), spot, speed_m_s)
 
 
 async def over_touch(
@@ -38,12 +37,11 @@ async def over_touch(
     spot: PlannedSpot,
     below: float,
     speed_m_s: float,
-    hubs: Array,
 ) -> tuple[Stroke, Path]:
     """As `over_circle`, for a stroke straight down to `below` metres under the table as it is
     known."""
     ends = np.vstack([rig.over(spot.xy[None], rig.lift), rig.over(spot.xy[None], -below)])
-    return await _over(run, cell, rig, pen.line(ends), spot, speed_m_s, hubs)
+    return await _over(run, cell, rig, pen.line(ends), spot, speed_m_s)
 
 
 async def _over(
@@ -53,10 +51,9 @@ async def _over(
     tips: Array,
     spot: PlannedSpot,
     speed_m_s: float,
-    hubs: Array,
 ) -> tuple[Stroke, Path]:
     stroke: Stroke = await run.call(pen.stroke, rig, tips, spot.yaw, speed_m_s * run.speed)
-    _, way = await go(run, cell, stroke.joints[:1], hubs)
+    _, way = await go(run, cell, stroke.joints[:1], gone(run))
     return stroke, way
 
 

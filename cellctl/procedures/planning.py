@@ -261,7 +261,7 @@ def reach(guard: Guard, here: Array, way: Array, hubs: Array) -> Path | None:
     """An allowed path from `here` to the end of `way` (n, 6), if need be over `hubs` (m, 6).
 
     Tried in this order: straight, by the way as it was planned, over one hub, over several, by
-    RRT-Connect.
+    RRT-Connect, by RRT-Connect to hubs and over these.
     """
     goal = way[-1]
     direct, planned = Path(goal[None]), Path(way)
@@ -282,4 +282,8 @@ def _detour(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
     road = Roadmap(guard, here, np.vstack([goal[None], hubs]))
     if 0 in road.index:
         return road.path(here, road.index[0])
-    return connect(guard, here, goal)
+    found = connect(guard, here, goal)
+    for _ in range(BRIDGES):
+        if found is None and road.bridge() and 0 in road.index:
+            found = road.path(here, road.index[0])
+    return found
