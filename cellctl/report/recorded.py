@@ -147,6 +147,8 @@ def _take_in(recorded: Recorded, history: History, entry: Entry) -> None:
     try:
         if not isinstance(entry.data, dict):
             raise TypeError("its data are no object")
+        if entry.kind == "sample" and not isinstance(entry.data["key"], str):
+            raise TypeError("its key is no text")
         standing = advance(recorded.standing, entry)
         history.add(entry)
     except NOT_AN_EVENT as error:
