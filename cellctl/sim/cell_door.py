@@ -10,7 +10,7 @@ from cellctl.errors import BadInput
 from cellctl.geometry import Array
 from cellctl.sim import requests as form
 from cellctl.sim.grid import describe
-from cellctl.sim.motion import TICK_S, Limits
+from cellctl.sim.motion import Limits
 from cellctl.sim.session import OK, Answer, Door, Session, state
 
 
@@ -111,8 +111,7 @@ async def robot_wait(session: Session, request: form.RobotWait) -> Answer:
     world, pace = session.cell.world, session.cell.pace
 
     def settles_at() -> float:
-        settled = world.arm.read(world.now).standstill_s >= request.standstill_s
-        return max(world.arm.moving_until(), world.now + (0.0 if settled else TICK_S))
+        return world.arm.settles_at(world.now, request.standstill_s)
 
     await pace.wait(settles_at, pace.now() + request.timeout_s)
     return state(world.arm.read(world.now)), b""

@@ -27,7 +27,7 @@ from cellctl.geometry import Array, Transform
 from cellctl.sim.endpoint import Endpoint
 from cellctl.sim.link import ANSWER_S, Link, SimClock
 
-SLICES_S = {"paced": 0.05, "stepped": 0.25}
+SLICES_S = {"paced": 0.05, "stepped": 0.5}
 """Cell time of one wait for the arm; what a stop may have to wait for."""
 STANDSTILL_S = 0.1
 """All measured joint speeds zero for this long is standstill: an arm that rings slowly passes

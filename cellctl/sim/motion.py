@@ -204,6 +204,20 @@ class Motion:
                     return float((tick - moving[-1]) * TICK_S)
         return tick * TICK_S - self._legs[0].t0
 
+    def settles_at(self, now: float, seconds: float) -> float:
+        """When, from `now` on in ticks, the motion will be over and all reported joint speeds have
+        been zero for `seconds`, if nothing comes in between."""
+        begin = max(now, self.standstill_at())
+        before, after = (int(np.ceil(s / TICK_S)) + 1 for s in (seconds, RING_S + seconds))
+        places = begin + TICK_S * np.arange(after + 1)
+        asked = np.floor(places / TICK_S + 1e-6).astype(int)
+        ticks = np.arange(asked[0] - before, asked[-1] + 1)
+        moving = self.encoders(ticks * TICK_S)[1].any(axis=1)
+        unmoved = max((ticks[0] - 1) * TICK_S, self._legs[0].t0)
+        newest = np.maximum.accumulate(np.where(moving, ticks * TICK_S, unmoved))
+        still = asked * TICK_S - newest[asked - ticks[0]] >= seconds - 1e-9
+        return float(places[int(np.argmax(still))]) if still.any() else float(places[-1])
+
     def frames(self, t: Array) -> Array:
         """True link frames (n, 7, 4, 4) in the world at times (n,); the last is the flange."""
         joints, _, slips = self._at(t)

@@ -26,8 +26,9 @@ WRITING_S = 0.004
 """The pen's way is sampled this finely: 0.2 mm at 50 mm/s, half a micron off a small circle."""
 CLOSE_M = 0.02
 """The pen is looked at closely when it is nearer to the table."""
-SLOW_LOOK_S = 0.032
-"""A stroke is slow: the rest of the arm is looked at less often than in a move."""
+COARSE, NEAR_M = 4, 0.08
+"""Contacts are looked for every so many ticks first, and at each tick where less than that is left;
+nothing moves so far in that time."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,10 @@ class Arm:
     def moving_until(self) -> float:
         return self._motion.standstill_at()
 
+    def settles_at(self, now: float, seconds: float) -> float:
+        """When the arm will have stood still for `seconds`, by its own measure."""
+        return self._motion.settles_at(now, seconds)
+
     def read(self, now: float) -> Reading:
         """The newest measurement at `now`. No standstill while a commanded motion is under way,
         even if nothing has been measured of it yet."""
@@ -296,10 +301,16 @@ class Arm:
 
     def _touches_at(self, now: float) -> Event | None:
         """The first contact of anything else with anything."""
-        step = SLOW_LOOK_S if self._stroking else TICK_S
-        times = np.arange(now, self._motion.standstill_at() + step, step)
+        times = np.arange(now, self._motion.standstill_at() + TICK_S, TICK_S)
+        gaps, pairs = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
+        limit = np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
+        near = np.repeat((gaps < limit + NEAR_M).any(axis=1), COARSE)
+        around = np.convolve(near, np.ones(2 * COARSE + 1), "same")[: len(times)] > 0
+        if not around.any():
+            return None
+        times = times[around]
         gaps, pairs = self._obstacles.gaps(self._motion.frames(times))
-        touching = gaps < np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
+        touching = gaps < limit
         if not touching.any():
             return None
         first = int(touching.any(axis=1).argmax())
