@@ -185,7 +185,7 @@ IR = Preset(
         forwards=True,
         dictionary="DICT_5X5_50",  # the camera sees the parked board beside the projected markers
     ),
-    fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.7)),
+    fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.4)),
 )
 
 PRESETS = {preset.name: preset for preset in (CR, IR)}
