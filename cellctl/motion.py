@@ -74,6 +74,27 @@ class Scene:
             near &= (beside**2).sum(axis=-1) + height.clip(min=0.0) ** 2 < reach**2
         return near
 
+    def names(self) -> list[str]:
+        """What a body must not do, in the order of `broken`."""
+        return [
+            "leaves the workspace box",
+            "comes too near to the table",
+            *(f"enters keep-out {keepout.name!r}" for keepout in self.keepouts),
+            *(f"comes too near to the {name}" for name, _, _ in self.balls),
+        ]
+
+    def broken(self, centres: Array, reach: Array) -> list[Mask]:
+        """Which of spheres at (n, m, 3) do so, `reach` (m,) being their radii with what they have
+        to keep: (n, m) each."""
+        room = np.minimum(centres - self.box_low, self.box_high - centres).min(axis=2)
+        broken = [room < reach, self.near_table(centres, reach)]
+        for keepout in self.keepouts:
+            away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
+            broken.append((away**2).sum(axis=-1) < reach**2)
+        for _, centre, radius in self.balls:
+            broken.append(((centres - centre) ** 2).sum(axis=-1) < (reach + radius) ** 2)
+        return broken
+
 
 @dataclass(frozen=True)
 class Violation:
@@ -112,6 +133,11 @@ class Guard:
             [body.radii + clearance_m * (body.frame > FIRST_FREE_FRAME) for body in free]
         )
         self._wraps = [body.wrapped() for body in bodies]
+        self._free = [i for i, body in enumerate(bodies) if body.frame >= FIRST_FREE_FRAME]
+        ends = np.cumsum([len(body.radii) for body in free])
+        self._parts = [slice(end - len(b.radii), end) for end, b in zip(ends, free, strict=True)]
+        kept = [clearance_m * (body.frame > FIRST_FREE_FRAME) for body in free]
+        self._wrap_reach = np.concatenate([self._wraps[i].radii for i in self._free]) + kept
         self._pairs = _pairs(bodies)
         self._pair_names = tuple(f"{bodies[i].name} and {bodies[j].name}" for i, j in self._pairs)
 
@@ -145,7 +171,8 @@ class Guard:
         outside = ~self.arm.within_limits(joints, self.joint_margin)
         limit = Rule("is at its limit", ("a joint",), outside[:, None])
         spheres = [body.world(frames) for body in self.bodies]
-        return [limit, *self._surroundings(spheres), self._self_collision(frames, spheres)]
+        wraps = [wrap.world(frames) for wrap in self._wraps]
+        return [limit, *self._surroundings(spheres, wraps), self._self_collision(spheres, wraps)]
 
     def check(self, start: Array, path: Path) -> None:
         """MotionRefused unless the whole path from the joints `start` (6,) is allowed."""
@@ -206,35 +233,31 @@ class Guard:
         centres, _ = self.spheres(joints)
         return float(PIECES * np.linalg.norm(np.diff(centres, axis=0), axis=2).max())
 
-    def _surroundings(self, spheres: list[Array]) -> list[Rule]:
-        scene, reach = self.scene, self._reach
-        free = [s for s, b in zip(spheres, self.bodies, strict=True) if b.frame >= FIRST_FREE_FRAME]
-        centres = np.concatenate(free, axis=1)
-        room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
-        on_table = scene.near_table(centres, self._reach)
-        rules = [
-            Rule("leaves the workspace box", self._who, room < reach),
-            Rule("comes too near to the table", self._who, on_table),
-        ]
-        for keepout in scene.keepouts:
-            away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
-            inside = (away**2).sum(axis=-1) < reach**2
-            rules.append(Rule(f"enters keep-out {keepout.name!r}", self._who, inside))
-        for name, centre, radius in scene.balls:
-            near = ((centres - centre) ** 2).sum(axis=-1) < (reach + radius) ** 2
-            rules.append(Rule(f"comes too near to the {name}", self._who, near))
-        return rules
+    def _surroundings(self, spheres: list[Array], wraps: list[Array]) -> list[Rule]:
+        """Looked at sphere by sphere where the ball around a body comes near to anything."""
+        names = self.scene.names()
+        broken = np.zeros((len(names), len(wraps[0]), len(self._who)), dtype=bool)
+        balls = np.concatenate([wraps[i] for i in self._free], axis=1)
+        near = np.logical_or.reduce(self.scene.broken(balls, self._wrap_reach))
+        for k, (i, part) in enumerate(zip(self._free, self._parts, strict=True)):
+            some = near[:, k]
+            if some.any():
+                broken[:, some, part] = self.scene.broken(spheres[i][some], self._reach[part])
+        return [Rule(name, self._who, mask) for name, mask in zip(names, broken, strict=True)]
 
-    def _self_collision(self, frames: Array, spheres: list[Array]) -> Rule:
+    def _self_collision(self, spheres: list[Array], wraps: list[Array]) -> Rule:
         """Which pairs of bodies meet: looked at sphere by sphere where the balls around them do."""
-        wraps = np.concatenate([wrap.world(frames) for wrap in self._wraps], axis=1)
+        balls = np.concatenate(wraps, axis=1)
         radii = np.concatenate([wrap.radii for wrap in self._wraps])
         i, j = np.array(self._pairs).T
-        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
+        near = ((balls[:, i] - balls[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
         for k in np.flatnonzero(near.any(axis=0)):
             a, b, some = i[k], j[k], near[:, k]
             one, other = spheres[a][some], spheres[b][some]
-            near[some, k] = _meet(one, self.bodies[a].radii, other, self.bodies[b].radii)
+            around = ((other - balls[some, a, None]) ** 2).sum(axis=-1)
+            close = (around < (radii[a] + self.bodies[b].radii) ** 2).any(axis=0)
+            other, other_radii = other[:, close], self.bodies[b].radii[close]
+            near[some, k] = close.any() and _meet(one, self.bodies[a].radii, other, other_radii)
         return Rule("meet", self._pair_names, near)
 
 

@@ -109,7 +109,9 @@ def test_the_side_of_a_table_is_a_clearance_away(edged):
 
 
 @given(st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3), st.floats(0.01, 0.5))
-def test_a_table_without_edges_is_one_of_which_nobody_comes_to_the_edge(guard, edged, centre, reach):
+def test_a_table_without_edges_is_one_of_which_nobody_comes_to_the_edge(
+    guard, edged, centre, reach
+):
     endless, ends = guard.scene, edged.scene
     wide = replace(ends, table_top=np.array([[-10.0, -10.0], [10.0, 10.0]]))
     sphere, radius = np.array([[centre]]), np.array([reach])

@@ -86,3 +86,4 @@ def test_far_below_the_camera_boards_are_smaller_and_nearer_to_the_middle(config
         sweep.spread.fill[1] / sweep.spread.fill[0]
     )
     assert (scaled.middle < 0.5) == (board == hand_eye.BOARD)
+    assert not scaled.about_camera
