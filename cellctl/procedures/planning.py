@@ -35,8 +35,10 @@ PLACING_ROUNDS = 3
 """Where a board appears depends on where it is: so often is its place in the picture put right."""
 BATCHES = 3
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-NEAR_M, HALF = 0.01, 0.5
-"""Closer to the camera than this nothing is looked at; see `attainable`."""
+NEAR_M = 0.01
+"""Closer to the camera than this nothing is looked at."""
+MOST_OF_PICTURE = 0.65
+"""Share of the play in the picture that boards which are to fill it use at least."""
 SPIRAL_STEP = 0.07
 """Radius of the search spiral's first point, in image widths."""
 
@@ -63,8 +65,8 @@ def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
 
     Where it cannot come as near as the largest `fill` asks for, all of `fill` is scaled down to
     what a board fills in the box's nearest corner. Boards stay as much nearer to the middle of
-    the picture, under which the table is; over half of it at least where they are to fill it. No
-    motion turns about a point near the camera then, so views are not picked for that.
+    the picture, under which the table is, but for those that are to fill it. No motion turns about
+    a point near the camera then, so views are not picked for that.
     """
     corners = itertools.product(*zip(guard.scene.box_low, guard.scene.box_high, strict=True))
     depths = transform_points(invert(rig.T_world_camera), np.array(list(corners)))[:, 2]
@@ -74,7 +76,7 @@ def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
     share = min(largest / high, 1.0)
     if share == 1.0:
         return spread
-    middle = max(share, HALF) if spread.to_the_edges else share
+    middle = max(share, MOST_OF_PICTURE) if spread.to_the_edges else share
     fill = (low * share, largest)
     return replace(spread, fill=fill, middle=middle * spread.middle, about_camera=False)
 
