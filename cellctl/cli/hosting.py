@@ -71,7 +71,7 @@ def _exit_once(number: int, _: object) -> None:
 
 
 def demo(
-    cell: Annotated[str, typer.Option(help="Which simulated cell: cr.")] = "cr",
+    cell: Annotated[str, typer.Option(help="Which simulated cell: cr or ir.")] = "cr",
     seed: Annotated[int, typer.Option(min=0, help="Draws the cell's true geometry.")] = 0,
     as_json: AsJson = False,
 ) -> int:
