@@ -26,7 +26,10 @@ from cellctl.sim.presets import PRESETS
 from cellctl.sim.truth import Truth, draw
 
 DARK: Light = ((1.0, None),)
-POSTURES = {"cr": (-76.0, -84.0, -111.0, -75.0, 90.0, -166.0)}
+POSTURES = {
+    "cr": (-76.0, -84.0, -111.0, -75.0, 90.0, -166.0),
+    "ir": (11.0, -8.0, 14.0, 0.0, -96.0, -11.0),
+}
 """Degrees: boards over the table, facing the camera."""
 MOVING_INSTANTS = 12
 

@@ -9,7 +9,7 @@ config says, and a person's arm is not in the config.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from cellctl.drivers.base import Path, Stroke
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array, Mask
 from cellctl.hulls import Body, box_body, link_bodies, pen_body
+from cellctl.scene import ENDLESS, TABLE, Keepout, Pen, Scene
 
 FIRST_FREE_FRAME = 2
 """Links before this one stand where the arm is bolted down: table and workspace box do not bind
@@ -32,64 +33,8 @@ COARSE = 8
 PIECES = 8
 """A joint line is cut into so many to find the speed of its fastest sphere."""
 PEN = "pen"
-TABLE = "comes too near to the table"
-ENDLESS = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
-"""The top of a table whose edges nobody has stated."""
 SLACK_M, SLACK_RAD = 0.005, 0.005
 """Half of MAX_STEP_M: another start shifts the states at which a path is sampled."""
-
-
-@dataclass(frozen=True, eq=False)
-class Keepout:
-    """A box (`low`, `high`) in the world, each (3,), that no sphere may touch."""
-
-    name: str
-    low: Array
-    high: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Pen:
-    """What may touch the table: `tip` (3,) in the flange frame gives way by `travel`, and may be
-    down on `sheets` (n, 2, 2), lowest and highest (x, y) each, in the world; metres."""
-
-    tip: Array
-    travel: float
-    sheets: Array
-
-    def tips(self, flanges: Array) -> Array:
-        """Tips (n, 3) in the world for T_world_flange (n, 4, 4)."""
-        return flanges[..., :3, :3] @ self.tip + flanges[..., :3, 3]
-
-    def on_sheet(self, xy: Array) -> Mask:
-        """Whether each of xy (n, 2) lies on a sheet."""
-        inside = (xy[:, None] >= self.sheets[:, 0]) & (xy[:, None] <= self.sheets[:, 1])
-        return np.logical_or.reduce(np.logical_and.reduce(inside, axis=2), axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What stands around the arm, in the world frame, metres. `balls`: (name, centre, radius).
-
-    The table is solid below `table_height`, within `table_top` (corners (2, 2), lowest first):
-    everywhere where that is infinite."""
-
-    box_low: Array
-    box_high: Array
-    table_height: float
-    keepouts: tuple[Keepout, ...]
-    balls: tuple[tuple[str, Array, float], ...]
-    table_top: Array = field(default_factory=lambda: ENDLESS)
-
-    def near_table(self, centres: Array, reach: Array) -> Mask:
-        """Whether spheres at (n, m, 3) come nearer to the table than `reach` (m,): (n, m)."""
-        height = centres[..., 2] - self.table_height
-        near = height < reach
-        if not np.isinf(self.table_top).all() and near.any():
-            low, high = self.table_top
-            beside = np.maximum(low - centres[..., :2], centres[..., :2] - high).clip(min=0.0)
-            near &= (beside**2).sum(axis=-1) + height.clip(min=0.0) ** 2 < reach**2
-        return near
 
 
 @dataclass(frozen=True)
@@ -130,6 +75,11 @@ class Guard:
             [body.radii + clearance_m * (body.frame > FIRST_FREE_FRAME) for body in free]
         )
         self._wraps = [body.wrapped() for body in bodies]
+        self._free = [i for i, body in enumerate(bodies) if body.frame >= FIRST_FREE_FRAME]
+        ends = np.cumsum([len(body.radii) for body in free])
+        self._parts = [slice(end - len(b.radii), end) for end, b in zip(ends, free, strict=True)]
+        kept = [clearance_m * (body.frame > FIRST_FREE_FRAME) for body in free]
+        self._wrap_reach = np.concatenate([self._wraps[i].radii for i in self._free]) + kept
         self._pairs = _pairs(bodies)
         self._pair_names = tuple(f"{bodies[i].name} and {bodies[j].name}" for i, j in self._pairs)
 
@@ -205,7 +155,8 @@ class Guard:
         outside = ~self.arm.within_limits(joints, self.joint_margin)
         limit = Rule("is at its limit", ("a joint",), outside[:, None])
         spheres = [body.world(frames) for body in self.bodies]
-        return [limit, *self._surroundings(spheres), self._self_collision(frames, spheres)]
+        wraps = [wrap.world(frames) for wrap in self._wraps]
+        return [limit, *self._surroundings(spheres, wraps), self._self_collision(spheres, wraps)]
 
     def check(self, start: Array, path: Path) -> None:
         """MotionRefused unless the whole path from the joints `start` (6,) is allowed."""
@@ -266,35 +217,31 @@ class Guard:
         centres, _ = self.spheres(joints)
         return float(PIECES * np.linalg.norm(np.diff(centres, axis=0), axis=2).max())
 
-    def _surroundings(self, spheres: list[Array]) -> list[Rule]:
-        scene, reach = self.scene, self._reach
-        free = [s for s, b in zip(spheres, self.bodies, strict=True) if b.frame >= FIRST_FREE_FRAME]
-        centres = np.concatenate(free, axis=1)
-        room = np.minimum(centres - scene.box_low, scene.box_high - centres).min(axis=2)
-        on_table = scene.near_table(centres, self._reach)
-        rules = [
-            Rule("leaves the workspace box", self._who, room < reach),
-            Rule(TABLE, self._who, on_table),
-        ]
-        for keepout in scene.keepouts:
-            away = np.maximum(keepout.low - centres, centres - keepout.high).clip(min=0.0)
-            inside = (away**2).sum(axis=-1) < reach**2
-            rules.append(Rule(f"enters keep-out {keepout.name!r}", self._who, inside))
-        for name, centre, radius in scene.balls:
-            near = ((centres - centre) ** 2).sum(axis=-1) < (reach + radius) ** 2
-            rules.append(Rule(f"comes too near to the {name}", self._who, near))
-        return rules
+    def _surroundings(self, spheres: list[Array], wraps: list[Array]) -> list[Rule]:
+        """Looked at sphere by sphere where the ball around a body comes near to anything."""
+        names = self.scene.names()
+        broken = np.zeros((len(names), len(wraps[0]), len(self._who)), dtype=bool)
+        balls = np.concatenate([wraps[i] for i in self._free], axis=1)
+        near = np.logical_or.reduce(self.scene.broken(balls, self._wrap_reach))
+        for k, (i, part) in enumerate(zip(self._free, self._parts, strict=True)):
+            some = near[:, k]
+            if some.any():
+                broken[:, some, part] = self.scene.broken(spheres[i][some], self._reach[part])
+        return [Rule(name, self._who, mask) for name, mask in zip(names, broken, strict=True)]
 
-    def _self_collision(self, frames: Array, spheres: list[Array]) -> Rule:
+    def _self_collision(self, spheres: list[Array], wraps: list[Array]) -> Rule:
         """Which pairs of bodies meet: looked at sphere by sphere where the balls around them do."""
-        wraps = np.concatenate([wrap.world(frames) for wrap in self._wraps], axis=1)
+        balls = np.concatenate(wraps, axis=1)
         radii = np.concatenate([wrap.radii for wrap in self._wraps])
         i, j = np.array(self._pairs).T
-        near = ((wraps[:, i] - wraps[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
+        near = ((balls[:, i] - balls[:, j]) ** 2).sum(axis=-1) < (radii[i] + radii[j]) ** 2
         for k in np.flatnonzero(near.any(axis=0)):
             a, b, some = i[k], j[k], near[:, k]
             one, other = spheres[a][some], spheres[b][some]
-            near[some, k] = _meet(one, self.bodies[a].radii, other, self.bodies[b].radii)
+            around = ((other - balls[some, a, None]) ** 2).sum(axis=-1)
+            close = (around < (radii[a] + self.bodies[b].radii) ** 2).any(axis=0)
+            other, other_radii = other[:, close], self.bodies[b].radii[close]
+            near[some, k] = close.any() and _meet(one, self.bodies[a].radii, other, other_radii)
         return Rule("meet", self._pair_names, near)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -75,6 +77,45 @@ def test_keep_out_is_named():
     left = free_pen_at(guard, -0.3, -0.45, 0.2)
     right = free_pen_at(guard, 0.3, -0.45, 0.2, left)
     assert "keep-out 'vice'" in refused(guard, left, right)
+
+
+@pytest.fixture(scope="module")
+def edged():
+    """A guard whose table ends at x = 0.2 m."""
+    document = cells.document()
+    document["table"]["top"] = {"min_m": [-0.9, -0.9], "max_m": [0.2, -0.1]}
+    document["workspace"]["box"]["min_m"][2] = -0.8
+    return guard_of(parse_config(document, "test"))
+
+
+def test_beside_the_table_the_arm_may_reach_below_it(guard, edged, start):
+    beside = free_pen_at(edged, 0.6, -0.45, -0.1, start)
+    assert "comes too near to the table" in refused(guard, start, beside)
+    over = free_pen_at(edged, 0.6, -0.45, 0.2, beside)
+    edged.check(beside, Path(over[None]))
+
+
+def test_a_table_with_edges_is_solid(edged, start):
+    low = pen_at(edged, 0.0, -0.45, -0.1, start)[0]
+    assert "comes too near to the table" in refused(edged, start, low)
+
+
+def test_the_side_of_a_table_is_a_clearance_away(edged):
+    """Spheres below the table's height: as near to its edge as their reach allows."""
+    centres = np.array([[[x, -0.45, -0.3] for x in (0.1, 0.24, 0.26)]])
+    assert edged.scene.near_table(centres, np.full(3, 0.05)).tolist() == [[True, True, False]]
+    above = np.array([[[0.23, -0.45, z] for z in (0.03, 0.05)]])
+    assert edged.scene.near_table(above, np.full(2, 0.05)).tolist() == [[True, False]]
+
+
+@given(st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3), st.floats(0.01, 0.5))
+def test_a_table_without_edges_is_one_of_which_nobody_comes_to_the_edge(
+    guard, edged, centre, reach
+):
+    endless, ends = guard.scene, edged.scene
+    wide = replace(ends, table_top=np.array([[-10.0, -10.0], [10.0, 10.0]]))
+    sphere, radius = np.array([[centre]]), np.array([reach])
+    assert endless.near_table(sphere, radius) == wide.near_table(sphere, radius)
 
 
 def test_camera_is_not_touched(guard, start):

@@ -18,7 +18,7 @@ from cellctl.procedures.record import Record, recorded
 from cellctl.run import Procedure, Result, Run
 
 BOARD = "checkerboard"
-SPREAD = Spread(fill=(0.2, 0.5), spin_deg=25.0)
+SPREAD = Spread(fill=(0.2, 0.5), spin_deg=25.0, to_the_edges=True)
 
 
 class IntrinsicParams(BaseModel):

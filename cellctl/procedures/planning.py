@@ -37,6 +37,8 @@ BATCHES = 3
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 NEAR_M = 0.01
 """Closer to the camera than this nothing is looked at."""
+MOST_OF_PICTURE = 0.65
+"""Share of the play in the picture that boards which are to fill it use at least."""
 SPIRAL_STEP = 0.07
 """Radius of the search spiral's first point, in image widths."""
 
@@ -45,27 +47,38 @@ SPIRAL_STEP = 0.07
 class Spread:
     """What candidates look like. Tilts in degrees about an axis in the image plane; `fill` is
     the share of the image's width that the board's longer side may take; `spin_deg` turns it in
-    its own plane. `about_camera` picks views for hand-eye, see `choice.about_camera`."""
+    its own plane. `middle` is the share of the picture that boards are spread over, and
+    `to_the_edges` says that it matters, see `attainable`. `about_camera` picks views for hand-eye,
+    see `choice.about_camera`."""
 
     tilt_deg: tuple[float, float] = (20.0, 45.0)
     spin_deg: float = 60.0
     fill: tuple[float, float] = (0.22, 0.42)
     middle: float = 1.0
+    to_the_edges: bool = False
     edge_px: float = 12.0
     about_camera: bool = False
 
 
 def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
-    """The spread with its `fill` scaled down where the workspace box does not come near enough to
-    the camera for it: the largest is then what a board fills at the box's nearest corner."""
+    """The spread as far as the arm can come near to the camera, which the workspace box tells.
+
+    Where it cannot come as near as the largest `fill` asks for, all of `fill` is scaled down to
+    what a board fills in the box's nearest corner. Boards stay as much nearer to the middle of
+    the picture, under which the table is, but for those that are to fill it. No motion turns about
+    a point near the camera then, so views are not picked for that.
+    """
     corners = itertools.product(*zip(guard.scene.box_low, guard.scene.box_high, strict=True))
     depths = transform_points(invert(rig.T_world_camera), np.array(list(corners)))[:, 2]
     side = np.ptp(rig.outline, axis=0).max()
     largest = rig.camera.K[0, 0] * side / (max(depths.min(), NEAR_M) * rig.camera.image_size[0])
-    if largest >= spread.fill[1]:
-        return spread
     low, high = spread.fill
-    return replace(spread, fill=(low * largest / high, largest))
+    share = min(largest / high, 1.0)
+    if share == 1.0:
+        return spread
+    middle = max(share, MOST_OF_PICTURE) if spread.to_the_edges else share
+    fill = (low * share, largest)
+    return replace(spread, fill=fill, middle=middle * spread.middle, about_camera=False)
 
 
 def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:

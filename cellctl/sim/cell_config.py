@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from cellctl.geometry import Array
 from cellctl.sim.bodies import plate_points, sheet
 from cellctl.sim.grid import drawing_joints, touched_height
-from cellctl.sim.presets import Preset
+from cellctl.sim.presets import Preset, SpeedPreset
 from cellctl.sim.textures import description
 from cellctl.sim.truth import STREAMS, Truth, draw, sheet_rectangle, tape_error
 
@@ -23,12 +23,6 @@ HULL_MARGIN_M, HULL_DEPTH_M = 0.02, 0.02
 LATENCY_SIGMAS = 6.0
 MAST_M = (0.20, 0.08, 1.6)
 """Width, depth and height of the mast at the table's far edge, for camera and projector."""
-
-SPEEDS = {
-    "joint_speed_deg_s": 40.0,
-    "joint_acceleration_deg_s2": 80.0,
-    "tcp_speed_m_s": 0.5,
-}
 
 COMMENTS = {
     "": """A simulated cell that runs as it is: `cellctl serve {path}`.
@@ -81,7 +75,7 @@ def cell_document(preset: Preset, seed: int) -> dict[str, Any]:
         },
         "simulation": {"preset": preset.name, "seed": seed, "time": "stepped"},
         "tape": {"position_m": preset.tape_off_m, "angle_deg": preset.tape_off_deg},
-        "robot": {"driver": "sim", "arm": preset.arm, **SPEEDS},
+        "robot": {"driver": "sim", "arm": preset.arm, **_speeds(preset.speeds)},
         "camera": _camera(truth, rng) | {"pose": taped["camera"]},
         "projector": _projector(preset) | {"pose": taped["projector"]},
         "table": _table(preset, height) | {"pose": taped["table"]},
@@ -111,6 +105,14 @@ def _camera(truth: Truth, rng: np.random.Generator) -> dict[str, Any]:
         "distortion": _rounded(lens.distortion * preset.factory_distortion_factor, 6),
     }
     return {"driver": "sim", "image_size_px": list(preset.size_px), "factory": factory}
+
+
+def _speeds(speeds: SpeedPreset) -> dict[str, float]:
+    return {
+        "joint_speed_deg_s": speeds.joint_deg_s,
+        "joint_acceleration_deg_s2": speeds.joint_deg_s2,
+        "tcp_speed_m_s": speeds.tcp_m_s,
+    }
 
 
 def _table(preset: Preset, height: float) -> dict[str, Any]:

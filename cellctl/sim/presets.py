@@ -116,6 +116,15 @@ class BoardPreset:
 
 
 @dataclass(frozen=True)
+class SpeedPreset:
+    """What the config caps motions at; nobody is near."""
+
+    joint_deg_s: float = 40.0
+    joint_deg_s2: float = 80.0
+    tcp_m_s: float = 0.5
+
+
+@dataclass(frozen=True)
 class FencePreset:
     """Where the arm may be, corners in the world, when camera and projector hang from the
     ceiling; without a fence they are on a mast at the table's far edge."""
@@ -139,6 +148,7 @@ class Preset:
     pen_slip_sigma_m: float = 0.15e-3
     tape_off_m: float = 0.10
     tape_off_deg: float = 10.0
+    speeds: SpeedPreset = SpeedPreset()
     fence: FencePreset | None = None
     body_radius_m: float = 0.05
     """Camera and projector are bodies of this radius around their optical centres."""
@@ -201,7 +211,8 @@ IR = Preset(
         forwards=True,
         dictionary="DICT_5X5_50",  # the camera sees the parked board beside the projected markers
     ),
-    fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.7)),
+    speeds=SpeedPreset(joint_deg_s=60.0, joint_deg_s2=120.0, tcp_m_s=1.5),
+    fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.4)),
 )
 
 PRESETS = {preset.name: preset for preset in (CR, IR)}

@@ -122,7 +122,7 @@ def test_the_large_cell_is_pinned(name, value):
 
 
 def test_the_large_cells_light_lies_along_the_table():
-    """Its long side along y, 1.24 mm a pixel; over all that is drawn in, not beside the table."""
+    """Its long side along y, 1.24 mm a pixel, over all that is drawn in, and on the table."""
     for seed in range(20):
         truth = draw(IR, seed)
         corners = truth.light_lands(np.array([(0, 0), (1919, 0), (1919, 1079), (0, 1079)]))
