@@ -211,6 +211,7 @@ IR = Preset(
         forwards=True,
         dictionary="DICT_5X5_50",  # the camera sees the parked board beside the projected markers
     ),
+    pen=PenPreset(line_m=2.0e-3),
     speeds=SpeedPreset(joint_deg_s=60.0, joint_deg_s2=120.0, tcp_m_s=1.5),
     fence=FencePreset(low_m=(-1.6, -2.2, 0.0), high_m=(2.5, 2.2, 2.4)),
 )
