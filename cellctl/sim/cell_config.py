@@ -17,7 +17,7 @@ from cellctl.sim.bodies import plate_points, sheet
 from cellctl.sim.grid import drawing_joints, touched_height
 from cellctl.sim.presets import Preset, SpeedPreset
 from cellctl.sim.textures import description
-from cellctl.sim.truth import STREAMS, Truth, draw, sheet_rectangle, tape_error
+from cellctl.sim.truth import STREAMS, Truth, draw, scoring_grid, sheet_rectangle, tape_error
 
 HULL_MARGIN_M, HULL_DEPTH_M = 0.02, 0.02
 LATENCY_SIGMAS = 6.0
@@ -153,9 +153,10 @@ def _projector(preset: Preset) -> dict[str, Any]:
 
 
 def _drawing_posture(truth: Truth) -> Array:
-    """Joints (6,) with the pen over the middle of the table, on the branch that draws."""
-    middle = np.array([truth.preset.table.centre_m[:2]])
-    return drawing_joints(truth, middle, truth.preset.table.centre_m[2])[0]
+    """Joints (6,) with the pen over the middle of the table, on the branch that draws: that on
+    which all of the area can be reached."""
+    grid = scoring_grid(truth.preset)
+    return drawing_joints(truth, grid, touched_height(truth))[len(grid) // 2]
 
 
 def _mount(truth: Truth, name: str, pose: dict[str, list[float]]) -> dict[str, Any]:
