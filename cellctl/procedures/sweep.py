@@ -31,6 +31,7 @@ from cellctl.procedures.planning import (
     first_reached,
     plan_sweep,
     reach,
+    retrace,
     search_views,
 )
 from cellctl.procedures.rig import PlannedView
@@ -230,10 +231,12 @@ def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
 
 
 async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
-    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6);
-    the settled state and that path. MotionRefused when there is none."""
+    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6) or
+    back where the arm came from; the settled state and that path. MotionRefused if there is none."""
     here = (await cell.robot.read()).joints
     path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
+    if path is None:
+        path = await run.call(retrace, cell.guard, here, way[-1], gone(run))
     if path is None:
         degrees = ", ".join(f"{v:.1f}" for v in np.degrees(way[-1]))
         raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")
