@@ -232,7 +232,7 @@ def sample_data(shot: Shot, way: Path) -> dict[str, Any]:
 
 async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
     """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6) or
-    back where the arm came from; the settled state and that path. MotionRefused if there is none."""
+    back where the arm came from; the settled state and that path. MotionRefused without one."""
     here = (await cell.robot.read()).joints
     path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
     if path is None:
