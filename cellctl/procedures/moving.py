@@ -10,7 +10,7 @@ from cellctl.drivers.base import Path, RobotState, Stroke, Target
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array
 from cellctl.procedures import pen
-from cellctl.procedures.planning import reach
+from cellctl.procedures.planning import reach, retrace
 from cellctl.run import Run
 
 MOVE_TIMEOUT_S = 120.0
@@ -32,12 +32,14 @@ async def posture(run: Run, cell: Cell) -> Array:
 
 
 async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
-    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6);
-    the settled state and that path. A pen that is down is lifted first. MotionRefused when there is
+    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6) or
+    back where the arm came from; the settled state and that path. A pen that is down is lifted first. MotionRefused when there is
     no path."""
     await lift_pen(run, cell)
     here = (await cell.robot.read()).joints
     path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
+    if path is None:
+        path = await run.call(retrace, cell.guard, here, way[-1], gone(run))
     if path is None:
         degrees = ", ".join(f"{v:.1f}" for v in np.degrees(way[-1]))
         raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")

@@ -20,7 +20,7 @@ from cellctl.geometry import Array, Mask, invert, transform_points
 from cellctl.motion import Guard
 from cellctl.procedures.choice import about_camera, features, spread_out
 from cellctl.procedures.rig import PlannedView, Rig
-from cellctl.procedures.routing import Roadmap, connect, nearest_first
+from cellctl.procedures.routing import Roadmap, connect, nearest_first, shortened
 
 IK_STARTS = 12
 OCCLUSION_GRID = 5
@@ -300,3 +300,16 @@ def _detour(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
         if found is None and road.bridge() and 0 in road.index:
             found = road.path(here, road.index[0])
     return found
+
+
+def retrace(guard: Guard, here: Array, goal: Array, came: Array) -> Path | None:
+    """From `here` back over the postures `came` (n, 6), oldest first, to the last one from which
+    a straight line leads to `goal`. For arms that have gone to where no search finds a way out."""
+    cautious = guard.cautious(here, goal)
+    for i in reversed(range(len(came))):
+        if cautious.allows(came[i], Path(goal[None])):
+            back = np.vstack([here, came[i:][::-1], goal])
+            if not guard.allows(here, Path(back[1:])):
+                return None
+            return Path(shortened(cautious, back, seed=i)[1:])
+    return None

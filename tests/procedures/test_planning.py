@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -115,6 +117,18 @@ def test_all_views_can_be_reached_in_order(guard, here, views):
         assert path is not None
         guard.check(here, path)
         here = view.joints
+
+
+def test_where_no_other_way_leads_out_the_arm_goes_back(guard, here, views):
+    """Over the postures that it came by, as far as a straight line leads to the goal."""
+    came = np.array([view.joints for view in views[:12]])
+    ways = [planning.reach(guard, a, b[None], came) for a, b in itertools.pairwise(came)]
+    gone = np.vstack([came[:1], *(way.waypoints for way in ways)])
+    path = planning.retrace(guard, gone[-1], came[0], gone)
+    assert path is not None
+    guard.check(gone[-1], path)
+    assert np.array_equal(path.waypoints[-1], came[0])
+    assert planning.retrace(guard, gone[-1], came[0] + 9.0, gone) is None
 
 
 def test_an_arm_before_the_camera_hides_the_board(rig, guard, views):
