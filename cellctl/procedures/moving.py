@@ -32,9 +32,9 @@ async def posture(run: Run, cell: Cell) -> Array:
 
 
 async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState, Path]:
-    """Move to the end of `way` (n, 6) over an allowed path, if need be by way of `hubs` (m, 6) or
-    back where the arm came from; the settled state and that path. A pen that is down is lifted first. MotionRefused when there is
-    no path."""
+    """Move to the end of `way` (n, 6) over an allowed path, if need be over `hubs` (m, 6) or back
+    where the arm came from; the settled state and that path. A pen that is down is lifted first.
+    MotionRefused when there is no path."""
     await lift_pen(run, cell)
     here = (await cell.robot.read()).joints
     path: Path | None = await run.call(reach, cell.guard, here, way, hubs)

@@ -21,8 +21,8 @@ from cellctl.motion import PEN, Guard
 
 STEP_M = 1e-3
 """Between two points of a stroke."""
-OVERLAP_RAD = np.radians(12.0)
-"""So far a circle goes on beyond its beginning, to be closed."""
+FILLET_M = 0.01
+"""How high above the lowest point a stroke begins to bend into its circle."""
 LIFT_SPARE_M = 0.018
 UP = np.array([0.0, 0.0, 1.0])
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -146,14 +146,22 @@ def line(points: Array, step: float = STEP_M) -> Array:
 
 
 def circle(rig: PenRig, centre: Array, radius: float) -> Array:
-    """Tips (n, 3) that come down onto a circle about `centre` (2,), draw it, and go up again."""
-    turn = 2 * np.pi + OVERLAP_RAD
-    angles = np.linspace(0.0, turn, int(np.ceil(turn * radius / STEP_M)) + 1)
+    """Tips (n, 3) that come down onto a circle about `centre` (2,), draw it, and go up again.
+
+    From straight down the way bends into the circle over a quarter of a turn of FILLET_M in
+    height, and out of it likewise, always above or on the circle: the pen need not slow down for
+    a corner, and leaves no ink but on the circle.
+    """
+    bend = np.linspace(0.0, np.pi / 2, int(np.ceil(np.pi / 2 * FILLET_M / STEP_M)) + 1)
+    before, height = FILLET_M * np.cos(bend), FILLET_M * (1.0 - np.sin(bend)) - rig.depth
+    around = np.linspace(0.0, 2 * np.pi, int(np.ceil(2 * np.pi * radius / STEP_M)) + 1)[1:-1]
+    angles = np.concatenate([-before / radius, around, (2 * np.pi + before / radius)[::-1]])
+    heights = np.concatenate([height, np.full(len(around), -rig.depth), height[::-1]])
     xy = centre + radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    drawn = rig.over(xy, -rig.depth)
+    tips = rig.on_table(xy) + heights[:, None] * rig.normal
     ends = rig.over(xy[[0, -1]], rig.lift)
-    return np.vstack([line(np.vstack([ends[:1], drawn[:1]])), drawn[1:-1],
-                      line(np.vstack([drawn[-1:], ends[1:]]))])  # fmt: skip
+    down, up = line(np.vstack([ends[:1], tips[:1]])), line(np.vstack([tips[-1:], ends[1:]]))
+    return np.vstack([down[:-1], tips, up[1:]])
 
 
 def stroke(rig: PenRig, tips: Array, yaw: float, speed_m_s: float) -> Stroke:

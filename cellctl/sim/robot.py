@@ -26,9 +26,9 @@ WRITING_S = 0.004
 """The pen's way is sampled this finely: 0.2 mm at 50 mm/s, half a micron off a small circle."""
 CLOSE_M = 0.02
 """The pen is looked at closely when it is nearer to the table."""
-COARSE, NEAR_M = 4, 0.08
+COARSE, NEAR_M, NEAR_STROKE_M = 4, 0.08, 0.01
 """Contacts are looked for every so many ticks first, and at each tick where less than that is left;
-nothing moves so far in that time."""
+nothing moves so far in that time, and in a stroke much less."""
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,8 @@ class Arm:
         times = np.arange(now, self._motion.standstill_at() + TICK_S, TICK_S)
         gaps, pairs = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
         limit = np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
-        near = np.repeat((gaps < limit + NEAR_M).any(axis=1), COARSE)
+        reach = NEAR_STROKE_M if self._stroking else NEAR_M
+        near = np.repeat((gaps < limit + reach).any(axis=1), COARSE)
         around = np.convolve(near, np.ones(2 * COARSE + 1), "same")[: len(times)] > 0
         if not around.any():
             return None

@@ -42,7 +42,9 @@ def test_a_stroke_follows_its_circle(circle):
     radii = np.linalg.norm(tips[down, :2] - CENTRE, axis=1)
     assert np.abs(radii - RADIUS).max() < 2e-5
     turned = np.unwrap(np.arctan2(*(tips[down, :2] - CENTRE).T[::-1]))
-    assert turned[-1] - turned[0] > 2 * np.pi
+    assert turned[-1] - turned[0] == pytest.approx(2 * np.pi, abs=0.02)
+    on_paper = np.linalg.norm(tips[over < 0.0, :2] - CENTRE, axis=1)
+    assert np.abs(on_paper - RADIUS).max() < 2e-5
     assert over[[0, -1]] == pytest.approx(RIG.lift, abs=1e-6)
     assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() < 1.05e-3
 
@@ -60,6 +62,12 @@ def test_the_tool_stays_upright_and_turned(circle):
     turn = np.degrees(np.arctan2(flanges[0, 1, 0], flanges[0, 0, 0]))
     start = np.degrees(np.arctan2(posture[1], posture[0]))
     assert (turn - start + 180) % 360 - 180 == pytest.approx(30.0, abs=0.2)
+
+
+def test_the_way_has_no_corner(circle):
+    steps = np.diff(tips_of(circle.joints), axis=0)
+    along = steps / np.linalg.norm(steps, axis=1)[:, None]
+    assert (along[1:] * along[:-1]).sum(axis=1).min() > np.cos(np.radians(15.0))
 
 
 def test_no_joint_jumps(circle):
