@@ -72,6 +72,16 @@ class ArmModel:
             [np.swapaxes(np.cross(axes, arms), -1, -2), np.swapaxes(axes, -1, -2)], axis=-2
         )
 
+    def may_reach(self, places: Array) -> Mask:
+        """Whether the flange may come to `places` (..., 3) in the base: necessary, not sufficient.
+
+        The second joint's axis goes through a circle around the first one; from there the flange
+        is away by the length of all other links at most.
+        """
+        out = np.linalg.norm(places[..., :2], axis=-1) - abs(self.a[0])
+        up = places[..., 2] - self.d[0]
+        return np.hypot(out, up) <= np.hypot(self.a[1:], self.d[1:]).sum()
+
     def perturbed(self, theta: Array, d: Array, a: Array, alpha: Array) -> ArmModel:
         """The same arm with these errors, (6,) each, added to its DH parameters."""
         return replace(

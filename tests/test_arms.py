@@ -62,3 +62,11 @@ def test_unreachable_pose_has_no_solution(model):
 def test_unknown_arm_lists_the_known_ones():
     with pytest.raises(BadInput, match="unknown arm 'ur55'"):
         arm("ur55")
+
+
+@arms
+def test_no_flange_is_where_the_arm_may_not_reach(model):
+    joints = np.random.default_rng(3).uniform(-np.pi, np.pi, (3000, 6))
+    places = model.forward(joints)[:, :3, 3]
+    assert model.may_reach(places).all()
+    assert not model.may_reach(1.5 * places[np.linalg.norm(places, axis=1).argmax()])

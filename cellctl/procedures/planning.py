@@ -37,6 +37,7 @@ BATCHES = 3
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 NEAR_M = 0.01
 """Closer to the camera than this nothing is looked at."""
+MORE_DRAWS = 2
 MOST_OF_PICTURE = 0.65
 """Share of the play in the picture that boards which are to fill it use at least."""
 SPIRAL_STEP = 0.07
@@ -47,9 +48,10 @@ SPIRAL_STEP = 0.07
 class Spread:
     """What candidates look like. Tilts in degrees about an axis in the image plane; `fill` is
     the share of the image's width that the board's longer side may take; `spin_deg` turns it in
-    its own plane. `middle` is the share of the picture that boards are spread over, and
-    `to_the_edges` says that it matters, see `attainable`. `about_camera` picks views for hand-eye,
-    see `choice.about_camera`."""
+    its own plane. `middle` is the share of the picture that boards are spread over, `to_the_edges`
+    says that it matters, see `attainable`. A sweep draws `draws` times as many candidates, and
+    keeps `postures` of the arm for each. `about_camera` picks views for hand-eye, see
+    `choice.about_camera`."""
 
     tilt_deg: tuple[float, float] = (20.0, 45.0)
     spin_deg: float = 60.0
@@ -57,6 +59,8 @@ class Spread:
     middle: float = 1.0
     to_the_edges: bool = False
     edge_px: float = 12.0
+    draws: int = 1
+    postures: int = 8
     about_camera: bool = False
 
 
@@ -66,7 +70,8 @@ def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
     Where it cannot come as near as the largest `fill` asks for, all of `fill` is scaled down to
     what a board fills in the box's nearest corner. Boards stay as much nearer to the middle of
     the picture, under which the table is, but for those that are to fill it. No motion turns about
-    a point near the camera then, so views are not picked for that.
+    a point near the camera then, so views are not picked for that. More candidates are drawn, for
+    most are out of reach, and one posture of each is enough.
     """
     corners = itertools.product(*zip(guard.scene.box_low, guard.scene.box_high, strict=True))
     depths = transform_points(invert(rig.T_world_camera), np.array(list(corners)))[:, 2]
@@ -77,8 +82,14 @@ def attainable(spread: Spread, rig: Rig, guard: Guard) -> Spread:
     if share == 1.0:
         return spread
     middle = max(share, MOST_OF_PICTURE) if spread.to_the_edges else share
-    fill = (low * share, largest)
-    return replace(spread, fill=fill, middle=middle * spread.middle, about_camera=False)
+    return replace(
+        spread,
+        fill=(low * share, largest),
+        middle=middle * spread.middle,
+        draws=MORE_DRAWS,
+        postures=1,
+        about_camera=False,
+    )
 
 
 def candidates(rig: Rig, spread: Spread, count: int, seed: int) -> Array:
@@ -149,14 +160,20 @@ def _blocked(points: Array, centres: Array, radii: Array) -> Mask:
 
 
 def feasible(
-    rig: Rig, guard: Guard, T_camera_board: Array, near: Array, edge_px: float
+    rig: Rig,
+    guard: Guard,
+    T_camera_board: Array,
+    near: Array,
+    edge_px: float,
+    postures: int = Spread.postures,
 ) -> list[PlannedView]:
     """The views that can be shown: in the picture, reachable, allowed by the guard, not hidden.
 
-    The same view may come several times, with different arm configurations; those nearest to the
-    posture `near` (6,) come first.
+    The same view may come up to `postures` times, with different arm configurations; those nearest
+    to the posture `near` (6,) come first.
     """
     seen = T_camera_board[visible(rig, T_camera_board, edge_px)]
+    seen = seen[guard.arm.may_reach(rig.flange(seen)[:, :3, 3])]
     starts = np.vstack([near, ik.random_starts(guard.arm, IK_STARTS, seed=7)])
     found = ik.solutions(guard.arm, rig.flange(seen), near, starts)
     owner = np.repeat(np.arange(len(seen)), [len(joints) for joints in found])
@@ -165,7 +182,10 @@ def feasible(
     joints = np.concatenate(found)
     good = guard.free(joints)
     good[good] = unhidden(rig, guard, seen[owner[good]], joints[good])
-    return [PlannedView(seen[o], j) for o, j in zip(owner[good], joints[good], strict=True)]
+    owner, joints = owner[good], joints[good]
+    rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
+    chosen = np.flatnonzero(rank < postures)
+    return [PlannedView(seen[owner[i]], joints[i]) for i in chosen]
 
 
 def search_views(
@@ -180,12 +200,14 @@ def search_views(
     if not len(had):
         flat = Spread(tilt_deg=(0.0, 20.0), spin_deg=180.0, fill=(0.16, 0.28), middle=0.9)
         flat = attainable(flat, rig, guard)
-        views = feasible(rig, guard, candidates(rig, flat, SEARCH_CANDIDATES, seed), here, edge_px)
+        drawn = candidates(rig, flat, SEARCH_CANDIDATES, seed)
+        views = feasible(rig, guard, drawn, here, edge_px, flat.postures)
         return sorted(views, key=lambda view: _from_spiral(rig, view, step))
     steep = min(15.0 + 5.0 * len(had), 35.0)
     tilted = Spread(tilt_deg=(0.6 * steep, steep), fill=(0.18, 0.32), middle=0.5)
     tilted = attainable(tilted, rig, guard)
-    views = feasible(rig, guard, candidates(rig, tilted, SEARCH_CANDIDATES, seed), here, edge_px)
+    drawn = candidates(rig, tilted, SEARCH_CANDIDATES, seed)
+    views = feasible(rig, guard, drawn, here, edge_px, tilted.postures)
     if not views:
         return []
     new = features(rig, np.array([view.T_camera_board for view in views]))
@@ -233,8 +255,9 @@ def _reachable_views(
     views: list[PlannedView] = []
     road = Roadmap(guard, here, np.empty((0, JOINTS)))
     for batch in range(BATCHES):
-        drawn = candidates(rig, spread, CANDIDATES + CANDIDATES_PER_VIEW * count, seed + batch)
-        found = feasible(rig, guard, drawn, here, spread.edge_px)
+        number = spread.draws * (CANDIDATES + CANDIDATES_PER_VIEW * count)
+        drawn = candidates(rig, spread, number, seed + batch)
+        found = feasible(rig, guard, drawn, here, spread.edge_px, spread.postures)
         views += found
         road.add(np.array([view.joints for view in found]).reshape(-1, JOINTS))
         bridged = BRIDGES
