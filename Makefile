@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
-	format-fix soak-kill soak-demo soak-core bench-render
+	format-fix soak-kill soak-faults soak-demo soak-core bench-render
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -48,6 +48,9 @@ unit: install
 
 soak-kill: install ## SIGKILL the daemon at KILLS random instants, resume, compare
 	$(BIN)/python -m tests.soak.kill --kills $(KILLS) --seed $(SEED)
+
+soak-faults: install ## A whole run for each fault of pen and paper: is it named?
+	$(BIN)/python -m tests.soak.faults --cell cr --seed $(SEED)
 
 soak-demo: install ## The demo on SEEDS: verdicts, and rows beside the numeric model's
 	$(BIN)/python -m benchmarks.stages --seeds $(SEEDS)

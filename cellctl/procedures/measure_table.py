@@ -5,6 +5,7 @@ Where neither arm nor pen holder feels a contact, an operator jogs the pen to th
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,12 @@ async def _ask(run: Run, cell: Cell, key: str, spot: PlannedSpot) -> None:
     )
     if answer == CANCEL:
         raise StepCancelled
-    await run.sample(key, _touched(await cell.robot.read(), spot))
+    state = await cell.robot.read()
+    tip = np.array(cell.config.bracket.pen.tip_m)
+    inked = replace(spot, xy=state.T_world_flange.apply(tip)[:2])
+    await paper.claim(run, cell, key, inked, DOT_M)
+    await paper.settle(run, cell, key, inked)
+    await run.sample(key, _touched(state, spot))
 
 
 def _touched(state: RobotState, spot: PlannedSpot) -> dict[str, Any]:

@@ -20,11 +20,15 @@ from cellctl.sim.drivers import SimRobot
 from cellctl.sim.endpoint import read_endpoint
 from cellctl.sim.launch import endpoint_file, stop_world
 from cellctl.sim.link import SimClock
+from cellctl.store import sheets
 
-QUICK = {
+QUICK: dict[str, Any] = {
     "intrinsic": {"views": 8},
     "hand_eye": {"views": 5},
     "projector": {"columns": 10, "rows": 6, "pictures": 1},
+    "measure_table": {"touches": 9},
+    "draw": {"spots": 6, "rounds": 2},
+    "evaluate": {"circles": 6},
 }
 """Parameters of a `full` that is done soon; good enough to pass."""
 
@@ -66,13 +70,15 @@ class CellRun:
     def client(self) -> Client:
         return Client(self.endpoint)
 
-    def finish(self, run_id: str) -> RunInfo:
-        """Wait for the end of a run."""
-        deadline = time.monotonic() + RUN_S
+    def finish(self, run_id: str, within_s: float = RUN_S) -> RunInfo:
+        """Wait for the end of a run; AssertionError when it asks what nobody answers."""
+        deadline = time.monotonic() + within_s
         with self.client() as client:
             while time.monotonic() < deadline:
                 info = client.run_info(run_id)
-                if info.status not in ("running", "waiting"):
+                if info.status == "waiting":
+                    raise AssertionError(f"run {run_id} asks: {info.question}")
+                if info.status != "running":
                     return info
                 time.sleep(0.1)
         raise AssertionError(f"run {run_id} did not end:\n{self.log()}")
@@ -97,6 +103,11 @@ class CellRun:
         """What result.json says, without what names the run."""
         document = json.loads((self.folder / "runs" / run_id / "result.json").read_text())
         return {key: document[key] for key in ("verdict", "reasons", "data")}
+
+    def spots(self) -> list[dict[str, Any]]:
+        """The ledger's spots on the paper that lies there."""
+        document = json.loads((self.folder / sheets.FILE).read_text())
+        return [spot for sheet in document["sheets"].values() for spot in sheet["spots"]]
 
     def close(self) -> None:
         if self._process is not None:

@@ -13,7 +13,7 @@ from cellctl.calib.calibration import Calibration
 from cellctl.demo import score
 from cellctl.offline import solve_folder
 from tests.integration.cellrun import QUICK, cell_run
-from tests.soak.kill import killed
+from tests.soak.kill import differences, killed
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_it_calibrates_alone(done):
         document = client.calibration(info.calibration_id).document
     calibration = Calibration.from_dict(document["calibration"])
     scored = asyncio.run(score(info, calibration, cell.folder))
-    assert scored["final"]["true_mm"] < 3.0
+    assert scored["final"]["true_mm"] < 1.0
     assert scored["collisions"] == 0
 
 
@@ -63,7 +63,7 @@ def test_killed_and_resumed_it_ends_with_the_same_result(done, tmp_path):
         run_id, interrupted, wrong = killed(other, [5.0, 11.0])
         assert (interrupted, wrong) == (2, [])
         assert other.finish(run_id).status == "done", other.log()
-        assert other.result(run_id) == cell.result(info.run_id)
+        assert differences(other, run_id, cell.result(info.run_id)) == []
 
 
 def samples_and_motion(cell, client, run_id):
