@@ -23,6 +23,8 @@ FAR = 4.0
 """Cost of being off beyond which a ring is another one."""
 NONE = 4.5
 """Cost of an expected ring without a ring: neighbours do not lend theirs to each other."""
+SURE = 0.5
+"""Looks of a ring that is whole, and within 8 % of its radius."""
 ROUNDS = 4
 FORBIDDEN = 1e6
 
@@ -39,7 +41,9 @@ def match_rings(
     number of its ring among those `found` (m, 2), or -1.
 
     First the shift that brings most rings home, then a smooth field about it (shift, turn and
-    stretch, held weakly), then the cheapest assignment of one to one.
+    stretch, held weakly), then the cheapest assignment of one to one. What is off in the tool is
+    off otherwise wherever the tool is turned: whole rings that are left go to who is left, where
+    that is unambiguous.
     """
     if not len(found):
         return np.full(len(wanted), -1)
@@ -59,7 +63,7 @@ def match_rings(
             home = gaps[np.flatnonzero(sure), chosen[sure]]
             field = _smooth_field(wanted, wanted[sure], home, like, search_m)
         chosen = _assign(gaps, field, near, looks, like)
-    return chosen
+    return _with_left_over(chosen, near & (looks < SURE))
 
 
 def _common_shift(gaps: Array, near: Mask, looks: Array, like: float) -> Array:
@@ -102,6 +106,15 @@ def _smooth_field(places: Array, at: Array, shifts: Array, like: float, search_m
         normal = (design.T * weights) @ design + prior
         fit = np.linalg.solve(normal, (design.T * weights) @ shifts)
     return np.column_stack([np.ones(len(places)), (places - middle) / extent]) @ fit
+
+
+def _with_left_over(chosen: Array, sure: Mask) -> Array:
+    """`chosen` (n,), and pairs of `sure` (n, m) of which neither has another partner left."""
+    free = np.full(sure.shape[1], True)
+    free[chosen[chosen >= 0]] = False
+    left = sure & free[None] & (chosen < 0)[:, None]
+    only = left & (left.sum(axis=1) == 1)[:, None] & (left.sum(axis=0) == 1)[None]
+    return np.where(only.any(axis=1), only.argmax(axis=1), chosen)
 
 
 def _assign(gaps: Array, field: Array, near: Mask, looks: Array, like: float) -> Array:

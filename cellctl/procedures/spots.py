@@ -71,6 +71,8 @@ def plan_spots(
     near = np.linalg.norm(xy[:, None] - taken, axis=2) < reach
     free = (owner >= 0) & ~np.logical_or.reduce(near, axis=1)
     xy, owner = xy[free], owner[free]
+    if not len(xy):
+        return []
     allowed, above = _postures(rig, xy, radius)
     chosen = _spread(xy, np.logical_or.reduce(allowed, axis=1), count, 2 * radius + MARGIN_M)
     spots = []

@@ -17,7 +17,16 @@ from tests.integration.known_cell import BOWED, KNOWN, known_cell
 
 DRAW = {"spots": 12, "rounds": 2}
 CIRCLES = 24
-WAIT_S = 60.0
+TURNS = (
+    (180, 0, 0),
+    (180, 0, -90),
+    (180, 0, 60),
+    (180, -30, 0),
+    (150, 0, 0),
+    (-150, 0, -90),
+)
+"""Of the flange, rpy in degrees, in which it is free to stand over the table."""
+WAIT_S = 120.0
 AWAY_M = 3e-3
 """A circle may lie so far from where it was commanded: errors of arm and pen."""
 
@@ -111,21 +120,19 @@ def test_pen_that_slips_is_named(paper):
     _, refined = faulty(paper)
     paper.plant("pen.slip", shift_mm=[-3.0, 0.0, 0.0])
     assert refined.verdict == "fail"
-    slip = r"the pen slipped by (2\.9|3\.\d) mm between circle-011 and circle-012 \(after round 1\)"
+    slip = r"the pen slipped by (2\.9|3\.\d) mm between \S+ and \S+ \(after round 1\)"
     assert any(re.match(slip, reason) for reason in refined.reasons), refined.reasons
 
 
 def test_sheet_that_moves_is_named(paper):
-    paper.plant(
-        "sheet.move",
-        sheet="A",
-        shift_mm=[4.0, -3.0],
-        turn_deg=0.3,
-        after_strokes=paper.strokes + 12,
-    )
+    """In round 2: what the picture before showed is seen somewhere else."""
+    later = paper.strokes + 12 + 1
+    paper.plant("sheet.move", sheet="A", shift_mm=[4.0, -3.0], turn_deg=0.3, after_strokes=later)
     drawing, _ = faulty(paper)
+    paper.plant("sheet.replace")
     assert drawing.verdict == "fail"
-    assert any("the sheet A moved by 5." in r for r in drawing.reasons), drawing.reasons
+    moved = r"the sheet A moved by (4\.9|5\.\d) mm \(0\.3 deg\) between after-0 and after-1"
+    assert any(re.match(moved, reason) for reason in drawing.reasons), drawing.reasons
 
 
 def test_pen_that_runs_dry_is_named(paper):
@@ -138,10 +145,12 @@ def test_pen_that_runs_dry_is_named(paper):
 
 def test_pen_that_is_mounted_off_is_named(paper):
     paper.plant("pen.off", shift_mm=[6.0, 0.0, 0.0])
-    _, refined = faulty(paper)
+    drawing, refined = faulty(paper)
     paper.plant("pen.off", shift_mm=[-6.0, 0.0, 0.0])
     assert refined.verdict == "fail"
-    assert any("the pen stands" in r for r in refined.reasons), refined.reasons
+    off = r"the pen stands (5\.[5-9]|6\.[0-5]) mm from where bracket\.pen\.tip_m says"
+    assert any(re.match(off, reason) for reason in refined.reasons), refined.reasons
+    assert drawing.reasons == []
 
 
 def test_circles_of_a_wrong_radius_are_named(paper):
@@ -158,8 +167,8 @@ def test_circles_that_are_half_drawn_are_left_out(paper):
     paper.plant("pen.ink")
     assert drawing.verdict == "pass", drawing.reasons
     rejected = {r["id"]: r["reason"] for r in drawing.result["data"]["rejected"]}
-    assert set(rejected) == {"circle-005", "circle-006"}
-    assert all("half" in reason for reason in rejected.values()), rejected
+    assert list(rejected) == list(drawn(paper, drawing.run_id))[5:7]
+    assert all(reason.startswith("half drawn") for reason in rejected.values()), rejected
 
 
 def test_a_table_that_is_not_known_well_enough_is_not_drawn_on(paper):
@@ -195,22 +204,22 @@ def test_full_paper_is_asked_about_and_replaced(worn):
     assert_one_circle_each(worn, drawn(worn, drawing.run_id).values())
 
 
-def test_killed_while_it_draws_it_draws_nothing_twice(worn):
+def test_killed_while_it_draws_it_draws_nothing_twice(tmp_path):
     """Once at any instant, once with the pen on the paper."""
-    before = len(rings(worn))
-    with worn.client() as client:
-        run_id = client.run("draw", DRAW).run_id
-    await_circles(worn, run_id, 3)
-    time.sleep(random.Random(0).uniform(0.0, 1.0))
-    worn.kill()
-    resumed(worn, run_id)
-    await_circles(worn, run_id, 12)
-    await_claim(worn)
-    worn.kill()
-    resumed(worn, run_id)
-    info = worn.finish(run_id)
-    assert (info.status, info.reasons) == ("done", [])
-    assert_whole(worn, run_id, before)
+    with known_cell(tmp_path) as cell:
+        with cell.client() as client:
+            run_id = client.run("draw", DRAW).run_id
+        await_circles(cell, run_id, 3)
+        time.sleep(random.Random(0).uniform(0.0, 1.0))
+        cell.kill()
+        resumed(cell, run_id)
+        await_circles(cell, run_id, 12)
+        await_claim(cell)
+        cell.kill()
+        resumed(cell, run_id)
+        info = cell.finish(run_id)
+        assert (info.status, info.verdict, info.reasons) == ("done", "pass", [])
+        assert_whole(cell, run_id)
 
 
 def await_circles(cell, run_id, count):
@@ -234,21 +243,20 @@ def resumed(cell, run_id):
         client.resume(run_id)
 
 
-def assert_whole(cell, run_id, before):
+def assert_whole(cell, run_id):
     """The right number of circles; what was cut short is void, and nothing was drawn twice, says
-    the journal as well as the world's paper, on which `before` circles were already."""
+    the journal as well as the world's paper."""
     circles = cell.circles(run_id)
     good = drawn(cell, run_id)
-    void = {key: circle for key, circle in circles.items() if circle["state"] == "void"}
+    cut = {key for key, circle in circles.items() if circle.get("flaw") == "cut short"}
     assert len(good) == CIRCLES
-    assert 1 <= len(void) <= 2
-    assert {circle["flaw"] for circle in void.values()} == {"cut short"}
+    assert 1 <= len(cut) <= 2
     spots = ledger(cell)["spots"]
     assert_apart(spots)
     mine = {s["owner"].split("/")[-1]: s["state"] for s in spots if s["owner"].startswith(run_id)}
     assert {key for key, state in mine.items() if state == "drawn"} == set(good)
-    assert {key for key, state in mine.items() if state == "claimed"} == set(void)
-    ink = np.array([ink["centre_m"][:2] for ink in rings(cell)[before:]])
+    assert {key for key, state in mine.items() if state == "claimed"} == cut
+    ink = np.array([ink["centre_m"][:2] for ink in rings(cell)])
     places = np.array([circle["xy"] for circle in circles.values()])
     nearest = np.linalg.norm(ink[:, None] - places, axis=2).argmin(axis=1)
     assert len(set(nearest)) == len(nearest)
@@ -268,16 +276,13 @@ def test_an_operator_finds_the_table_with_the_pendant(worn):
 
 def test_an_operator_finds_the_pen_by_pivoting(worn):
     worn.plant("pen.off", shift_mm=[6.0, 0.0, 0.0])
-    turns = iter(
-        [(180, 0, 0), (180, 0, 90), (180, 30, 180), (155, 0, 0), (180, -30, 90), (155, 20, 30)]
-    )
+    turns = iter(TURNS)
 
     def place(question):
-        worn.plant("pendant.place", point=[0.0, -0.4, 0.15], rpy_deg=list(next(turns)))
+        worn.plant("pendant.place", point=[0.0, -0.4, 0.2], rpy_deg=list(next(turns)))
         return question.choices[0]
 
     found = worn.run("tcp", poses=6, answer=place)
     assert (found.verdict, found.reasons) == ("pass", [])
-    print(found.result["data"])
     tip = np.array(found.result["data"]["tip_m"])
     assert 1e3 * np.linalg.norm(tip - worn.tip()) < 0.3

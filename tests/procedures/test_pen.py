@@ -160,3 +160,8 @@ def test_every_planned_spot_can_be_drawn(planned):
 def test_upright_spots_keep_the_drawing_posture_where_they_can():
     some = spots.plan_spots(RIG, CONFIG, [], 20, RADIUS, 1, False)
     assert np.count_nonzero([spot.yaw == 0.0 for spot in some]) >= 12
+
+
+def test_on_full_paper_there_is_no_spot():
+    full = [("A", Spot(0.0, 0.0, 5.0, "before", "drawn"))]
+    assert spots.plan_spots(RIG, CONFIG, full, 4, RADIUS, 0) == []
