@@ -117,7 +117,7 @@ async def collect(run: Run, cell: Cell, params: EvaluateParams, calibration: Cal
     here = await posture(run, cell)
     drawing = drawing_of(cell.config, cell.guard, calibration, asked, here)
     await pictures.blank(run, cell, calibration)
-    sight = await pictures.sight(run, calibration)
+    sight = await pictures.sight(run, calibration, pictures.RING_FACTOR)
     await run.step(CIRCLES, drawing.count)
     spots = await paper.planned(
         run,

@@ -35,16 +35,18 @@ LOOKS, GLARE = 24, 240
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A `picture` of the blank paper as a camera takes it: where a line could be seen in it."""
+    """A picture of the blank paper: where circles, and what is `factor` times as large around them,
+    could be seen in it."""
 
     image: Image
     base: Calibration
+    factor: float = 1.0
 
     def shows(self, xy: Array, radius: float) -> Mask:
         """Whether circles of `radius` metres about world xy (n, 2) are in the picture, and not lost
         in glare: (n,)."""
         angles = np.linspace(0.0, 2 * np.pi, LOOKS, endpoint=False)
-        around = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        around = self.factor * radius * np.column_stack([np.cos(angles), np.sin(angles)])
         pixels = self.base.picture((xy[:, None] + around).reshape(-1, 2))
         grey = self.image if self.image.ndim == 2 else self.image.max(axis=2)
         at = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(int)
@@ -81,10 +83,10 @@ async def blank(run: Run, cell: Cell, base: Calibration) -> None:
         await run.sample(BLANK, {}, {"image": image})
 
 
-async def sight(run: Run, base: Calibration) -> Sight:
+async def sight(run: Run, base: Calibration, factor: float = 1.0) -> Sight:
     """What the picture of the blank paper says."""
     blank_picture = run.samples(PICTURES)[BLANK].images["image"]
-    return Sight(await asyncio.to_thread(blank_picture.load), base)
+    return Sight(await asyncio.to_thread(blank_picture.load), base, factor)
 
 
 async def of_circles(
