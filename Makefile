@@ -4,6 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 SEED   ?= 0
 SEEDS  ?= 0-9
+CELLS  ?= cr ir
 KILLS  ?= 30
 JOBS   ?= 2
 
@@ -26,8 +27,8 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-demo: install ## Calibrate the simulated cell, unattended
-	$(BIN)/cellctl demo --cell cr --seed $(SEED)
+demo: install ## Calibrate the simulated cells CELLS, unattended, and prove it
+	@for cell in $(CELLS); do $(BIN)/cellctl demo --cell $$cell --seed $(SEED) || exit; done
 
 test: install format lint types imports unit ## Everything that CI checks
 
@@ -52,8 +53,8 @@ soak-kill: install ## SIGKILL the daemon at KILLS random instants, resume, compa
 soak-faults: install ## A whole run for each fault of pen and paper: is it named?
 	$(BIN)/python -m tests.soak.faults --cell cr --seed $(SEED)
 
-soak-demo: install ## The demo on SEEDS: verdicts, and rows beside the numeric model's
-	$(BIN)/python -m benchmarks.stages --seeds $(SEEDS)
+soak-demo: install ## The demo of CELLS on SEEDS: verdicts, true errors, rows beside the model's
+	for cell in $(CELLS); do $(BIN)/python -m benchmarks.stages --cell $$cell --seeds $(SEEDS) || exit; done
 
 soak-core: install ## Kill the engine with a toy procedure KILLS times
 	CELLCTL_SOAK=$(KILLS) $(BIN)/pytest tests/core/test_crash.py

@@ -2,9 +2,10 @@
 
     python -m benchmarks.stages --cell cr --seeds 0-9
 
-Prints a line a seed, then the median true error of each row, what the numeric model of the same
-world gives, and their ratio. Exit code 1 when a verdict is not `pass`, something was touched, or
-one of the published rows is off by more than 30 %.
+Prints two lines a seed, then the median true error of each row, what the numeric model of the same
+world gives, and their ratio; and how often the interval on circles that no fit has seen holds the
+true error. Exit code 1 when a verdict is not `pass`, the true error is 0.6 mm or more, something
+was touched, one of the published rows is off by more than 30 %, or the intervals hold too rarely.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from scipy import stats
 
 from cellctl.demo import run_demo
 
@@ -39,6 +42,9 @@ MODEL_MM = {
 """Median true mm of the numeric model: 40 seeds, corner noise 0.07 px, nothing rendered."""
 PUBLISHED = 5
 TOLERANCE = 0.30
+TRUE_MM = 0.6
+RATE, UNLIKELY = 0.95, 0.05
+"""Of the intervals; fewer hits than chance gives once in twenty times are too few."""
 
 
 def seeds(text: str) -> list[int]:
@@ -57,7 +63,37 @@ def one(cell: str, seed: int) -> dict[str, Any]:
         f"{result['samples']} samples  {result['wall_s']:.0f} s  {'; '.join(final['reasons'])}",
         flush=True,
     )
+    if held(result) is not None:
+        low, high = final["held_out_ci_mm"]
+        print(
+            f"          held out {final['held_out_mm']:.3f} mm, 95 %: {low:.3f} to {high:.3f}; "
+            f"true {final['true_mm']:.3f} mm",
+            flush=True,
+        )
     return result
+
+
+def held(result: dict[str, Any]) -> bool | None:
+    """Whether the interval holds the true error; None when there is none."""
+    final = result["final"]
+    if final["held_out_ci_mm"] is None or final["true_mm"] is None:
+        return None
+    low, high = final["held_out_ci_mm"]
+    return bool(low <= final["true_mm"] <= high)
+
+
+def proof(results: list[dict[str, Any]]) -> list[str]:
+    """Print what the circles that no fit has seen are worth; what is wrong with it."""
+    wrong = [
+        f"seed {result['seed']}: true error {result['final']['true_mm']} mm"
+        for result in results
+        if not (result["final"]["true_mm"] or TRUE_MM) < TRUE_MM
+    ]
+    hits = [hit for hit in map(held, results) if hit is not None]
+    print(f"\nthe interval holds the true error in {sum(hits)} of {len(hits)} runs")
+    if hits and stats.binom.cdf(sum(hits), len(hits), RATE) < UNLIKELY:
+        wrong.append(f"only {sum(hits)} of {len(hits)} intervals hold the true error")
+    return wrong
 
 
 def compare(cell: str, results: list[dict[str, Any]]) -> list[str]:
@@ -79,7 +115,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=seeds, default=seeds("0-9"))
     options = parser.parse_args()
     results = [one(options.cell, seed) for seed in options.seeds]
-    wrong = compare(options.cell, results)
+    wrong = compare(options.cell, results) + proof(results)
     wrong += [f"seed {r['seed']}: {r['final']['verdict']}" for r in results if _failed(r)]
     print(f"\n{len(results)} seeds, {len(wrong)} failures")
     for line in wrong:

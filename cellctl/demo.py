@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -29,6 +30,7 @@ from cellctl.config import load_config
 from cellctl.errors import BadInput, CellctlError, Unreachable
 from cellctl.messages import RunInfo
 from cellctl.procedures.comparison import STAGE_OF
+from cellctl.report import write_report
 from cellctl.sim.cell_config import cell_document, to_toml
 from cellctl.sim.endpoint import read_endpoint
 from cellctl.sim.launch import endpoint_file, stop_world
@@ -85,12 +87,26 @@ def run_demo(
         "cell": cell,
         "seed": seed,
         **result,
+        "report": str(_report(Path(info.directory), result)),
         "paper": published.PAPER.get(PRESETS[cell].arm),
         "samples": info.samples,
         "run": info.run_id,
         "record": info.directory,
         "wall_s": round(time.monotonic() - started, 1),
     }
+
+
+def _report(run: Path, result: dict[str, Any]) -> Path:
+    """The run's report, with what is true beside what was measured."""
+    rows = {
+        row["row"]: {"true_px": row["true_px"], "true_mm": row["true_mm"]}
+        for row in result["table"]
+    }
+    final = {key: result["final"][key] for key in ("true_px", "true_mm")}
+    truth = run / "report" / "truth.json"
+    truth.parent.mkdir(exist_ok=True)
+    truth.write_text(json.dumps({"rows": rows, "final": final}), encoding="utf-8")
+    return write_report(run)
 
 
 def write_config(cell: str, seed: int, folder: Path) -> Path:

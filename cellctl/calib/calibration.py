@@ -73,6 +73,10 @@ class Calibration:
         frame[:3, 3] = foot
         return self.T_world_camera.inverse().matrix @ frame
 
+    def picture(self, points: ArrayLike) -> Array:
+        """Camera pixels (n, 2), raw, of the points (x, y) of the world, (n, 2), on the table."""
+        return self.camera.project(self.T_world_camera.inverse().apply(self._on_table(points)))
+
     def on(self, surface: TableSurface) -> Calibration:
         """The same cell with this table, as it was measured. A refinement was made for another
         table, and is left out."""
@@ -81,9 +85,7 @@ class Calibration:
     def project(self, points: ArrayLike) -> Array:
         """Projector pixels (n, 2) that light the points (x, y) of the world, (n, 2), on the table.
         With (n, 3) the height is not looked at: light is only known where it lands."""
-        ground = np.asarray(points, dtype=float)[..., :2]
-        in_world = np.concatenate([ground, self.table.height(ground)[..., None]], axis=-1)
-        in_camera = self.T_world_camera.inverse().apply(in_world)
+        in_camera = self.T_world_camera.inverse().apply(self._on_table(points))
         if self.raw_pixels:
             xy = self.camera.plane(self.camera.project(in_camera))
         else:
@@ -91,6 +93,10 @@ class Calibration:
         if self.refinement is not None:
             xy = self.refinement.apply(xy)
         return self.projector.project(xy)
+
+    def _on_table(self, points: ArrayLike) -> Array:
+        ground = np.asarray(points, dtype=float)[..., :2]
+        return np.concatenate([ground, self.table.height(ground)[..., None]], axis=-1)
 
     def locate(self, pixels: ArrayLike) -> Array:
         """World points (n, 3) on the table that the projector pixels (n, 2) light."""

@@ -53,7 +53,9 @@ class Plane:
         """Read `to_dict`'s form. BadInput says `where` and what is wrong."""
         try:
             return cls(value["point"], value["normal"])
-        except (KeyError, TypeError) as error:
-            raise BadInput(f"{where}: needs point and normal ({error!r})") from None
+        except KeyError as error:
+            raise BadInput(f"{where}: missing key {error}") from None
+        except TypeError:
+            raise BadInput(f"{where}: must be an object with point and normal") from None
         except BadInput as error:
             raise BadInput(f"{where}: {error.message}") from None

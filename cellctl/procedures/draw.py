@@ -98,11 +98,14 @@ def radius_of(base: Calibration, radius_mm: float | None) -> float:
 async def collect(run: Run, cell: Cell, params: DrawParams, base: Calibration) -> None:
     """Draw all rounds, with a picture before the first and after each."""
     drawing = drawing_of(cell.config, cell.guard, base, params, await posture(run, cell))
+    await pictures.blank(run, cell, base)
+    sight = await pictures.sight(run, base)
     await run.step(CIRCLES, drawing.count * drawing.rounds)
     total = drawing.count * drawing.rounds
-    spots = await paper.planned(run, cell, drawing.rig, total, drawing.radius, drawing.seed)
+    spots = await paper.planned(
+        run, cell, drawing.rig, total, drawing.radius, drawing.seed, sight=sight
+    )
     search = 1e-3 * params.search_mm
-    await pictures.blank(run, cell, base)
     place = 0
     for number in range(drawing.rounds):
         place = await draw_round(run, cell, drawing, spots, place, number)

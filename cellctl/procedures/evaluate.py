@@ -116,9 +116,18 @@ async def collect(run: Run, cell: Cell, params: EvaluateParams, calibration: Cal
     asked = params.drawing()
     here = await posture(run, cell)
     drawing = drawing_of(cell.config, cell.guard, calibration, asked, here)
+    await pictures.blank(run, cell, calibration)
+    sight = await pictures.sight(run, calibration, pictures.RING_FACTOR)
     await run.step(CIRCLES, drawing.count)
     spots = await paper.planned(
-        run, cell, drawing.rig, drawing.count, drawing.radius, drawing.seed, turned=False
+        run,
+        cell,
+        drawing.rig,
+        drawing.count,
+        drawing.radius,
+        drawing.seed,
+        turned=False,
+        sight=sight,
     )
     await draw_round(run, cell, drawing, spots, 0, 0)
     circles = drawn.circles(run.samples(CIRCLES))

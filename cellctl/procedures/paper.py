@@ -6,7 +6,7 @@ from __future__ import annotations
 from cellctl.cell import Cell
 from cellctl.errors import SolveError
 from cellctl.procedures.pen import PenRig
-from cellctl.procedures.spots import PlannedSpot, plan_spots
+from cellctl.procedures.spots import PlannedSpot, Sight, plan_spots
 from cellctl.run import CANCEL, Run, StepCancelled
 from cellctl.store.sheets import Spot
 
@@ -24,6 +24,7 @@ async def planned(
     seed: int,
     *,
     turned: bool = True,
+    sight: Sight | None = None,
 ) -> list[PlannedSpot]:
     """At least `count` spots for circles of `radius` metres, best spread first, then spares; see
     `plan_spots`.
@@ -33,7 +34,7 @@ async def planned(
     """
     recorded = run.recall(SPOTS)
     if recorded is None:
-        spots = await _enough(run, cell, rig, count, radius, seed, turned=turned)
+        spots = await _enough(run, cell, rig, count, radius, seed, turned=turned, sight=sight)
         recorded = {"spots": [spot.to_dict() for spot in spots]}
         await run.record(SPOTS, **recorded)
     return [PlannedSpot.from_dict(spot) for spot in recorded["spots"]]
@@ -48,6 +49,7 @@ async def _enough(
     seed: int,
     *,
     turned: bool,
+    sight: Sight | None,
 ) -> list[PlannedSpot]:
     names = [sheet.name for sheet in cell.config.sheets]
     if not names:
@@ -56,7 +58,7 @@ async def _enough(
         used = [(name, spot) for name in names for spot in cell.sheets.spots(name)]
         wanted = count + int(SPARES * count)
         spots: list[PlannedSpot] = await run.call(
-            plan_spots, rig, cell.config, used, wanted, radius, seed, turned
+            plan_spots, rig, cell.config, used, wanted, radius, seed, turned, sight
         )
         if len(spots) >= count:
             return spots

@@ -18,7 +18,7 @@ from cellctl.calib.circles import Expected, find_circles
 from cellctl.calib.printed import Unseen
 from cellctl.cell import Cell
 from cellctl.drivers.base import Image
-from cellctl.geometry import Array
+from cellctl.geometry import Array, Mask
 from cellctl.procedures.capture import darken, grab_still, mean_image
 from cellctl.procedures.parking import park_again
 from cellctl.run import Run
@@ -29,6 +29,31 @@ DETECT_TIMEOUT_S = 60.0
 RING_FACTOR, RING_WIDTH_PX, RING_POINTS = 1.6, 3, 180
 """A ring is projected around each circle, so much larger, so wide; as a polygon."""
 SUBPIXEL_BITS = 8
+LOOKS, GLARE = 24, 240
+"""At so many places of a circle the blank paper must be darker than that."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A picture of the blank paper: where circles, and what is `factor` times as large around them,
+    could be seen in it."""
+
+    image: Image
+    base: Calibration
+    factor: float = 1.0
+
+    def shows(self, xy: Array, radius: float) -> Mask:
+        """Whether circles of `radius` metres about world xy (n, 2) are in the picture, and not lost
+        in glare: (n,)."""
+        angles = np.linspace(0.0, 2 * np.pi, LOOKS, endpoint=False)
+        around = self.factor * radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        pixels = self.base.picture((xy[:, None] + around).reshape(-1, 2))
+        grey = self.image if self.image.ndim == 2 else self.image.max(axis=2)
+        at = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(int)
+        inside = ((at > 0) & (at < np.array(grey.shape[::-1]) - 1)).all(axis=1)
+        column, row = np.clip(at, 0, np.array(grey.shape[::-1]) - 1).T
+        good = inside & (grey[row, column] < GLARE)
+        return np.logical_and.reduce(good.reshape(len(xy), LOOKS), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +81,12 @@ async def blank(run: Run, cell: Cell, base: Calibration) -> None:
     if BLANK not in run.samples():
         image = await _take(run, cell, base, BLANK, _white(cell))
         await run.sample(BLANK, {}, {"image": image})
+
+
+async def sight(run: Run, base: Calibration, factor: float = 1.0) -> Sight:
+    """What the picture of the blank paper says."""
+    blank_picture = run.samples(PICTURES)[BLANK].images["image"]
+    return Sight(await asyncio.to_thread(blank_picture.load), base, factor)
 
 
 async def of_circles(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,6 +22,16 @@ ON_EDGE = 0.3
 YAWS_DEG = (0.0, 180.0, 30.0, -150.0, -30.0, 150.0, 60.0, -120.0, -60.0, 120.0, 90.0, -90.0)
 MARGIN_M = 0.008
 """Free paper between two lines."""
+
+
+class Sight(Protocol):
+    """A camera on the paper."""
+
+    def shows(self, xy: Array, radius: float) -> Mask:
+        """Whether circles about xy (n, 2) can be seen: (n,)."""
+        ...
+
+
 Used = Sequence[tuple[str, Spot]]
 """Spots with the name of their sheet."""
 
@@ -56,12 +66,13 @@ def plan_spots(
     radius: float,
     seed: int,
     turned: bool = True,
+    sight: Sight | None = None,
 ) -> list[PlannedSpot]:
     """Up to `count` spots for circles of `radius` metres, far from each other, best spread first.
 
     With `turned` the tool's yaw changes from spot to spot as far as the guard allows, so that what
     is off at the tool can be told from what is off in the cell; without, it is 0 where the guard
-    allows that.
+    allows that. With `sight`, only where a line would be seen.
     """
     rng = np.random.default_rng(seed)
     xy = _candidates(config, rng)
@@ -69,7 +80,8 @@ def plan_spots(
     taken = np.array([(s.x, s.y) for _, s in used]).reshape(-1, 2)
     reach = np.array([s.radius_m for _, s in used]) + radius + MARGIN_M
     near = np.linalg.norm(xy[:, None] - taken, axis=2) < reach
-    free = (owner >= 0) & ~np.logical_or.reduce(near, axis=1)
+    seen = np.ones(len(xy), bool) if sight is None else sight.shows(xy, radius)
+    free = (owner >= 0) & seen & ~np.logical_or.reduce(near, axis=1)
     xy, owner = xy[free], owner[free]
     if not len(xy):
         return []

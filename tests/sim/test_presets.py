@@ -95,6 +95,7 @@ LARGE = dict(PINNED) | {
     "boards.markers": (3, 5),
     "boards.marker_m": 0.080,
     "boards.pitch_m": 0.100,
+    "pen.line_m": 2e-3,
 }
 """What the large cell has; everything else as in the small one."""
 SEEDS = 300
