@@ -14,7 +14,7 @@ from cellctl.cli.display import ProgressBar
 from cellctl.cli.logs import log_to_stderr
 from cellctl.cli.options import AsJson, ConfigFile
 from cellctl.cli.output import emit, say
-from cellctl.cli.results import print_data, print_table, print_verdict
+from cellctl.cli.results import print_data, print_table, print_table_two, print_verdict
 from cellctl.errors import BadInput
 
 
@@ -86,7 +86,7 @@ def demo(
         emit(result)
     else:
         print_verdict(result["final"]["verdict"], result["final"].get("reasons"))
-        print_table("Table II, ours and the paper's", result["table"])
+        print_table_two(result["table"])
         print_table("The published pipeline, stage by stage", result["stages"])
-        print_data({k: v for k, v in result.items() if k not in ("table", "stages")})
+        print_data({k: v for k, v in result.items() if k not in ("table", "stages", "paper")})
     return 0 if result["final"]["verdict"] == "pass" else 1

@@ -12,6 +12,8 @@ from cellctl.messages import RunInfo
 
 MAX_ROWS = 40
 NAME_WIDTH = 26
+DRAWN_IN_REPORT = ("table", "arrows")
+"""Of a result: its table is printed as one, its arrows are for the report."""
 
 
 def print_run(run: RunInfo) -> None:
@@ -23,7 +25,9 @@ def print_run(run: RunInfo) -> None:
         say(f"It asks: {run.question.text}")
     data = (run.result or {}).get("data")
     if isinstance(data, dict):
-        print_data(data)
+        print_data({name: value for name, value in data.items() if name not in DRAWN_IN_REPORT})
+        if isinstance(rows := data.get("table"), list):
+            print_table_two(rows)
     facts = {
         "calibration": run.calibration_id,
         "recorded": f"{run.samples} samples in {run.directory}" if run.directory else None,
@@ -75,6 +79,26 @@ def print_table(title: str, rows: list[dict[str, Any]]) -> None:
     out.print(table)
     if len(rows) > MAX_ROWS:
         say(f"... and {len(rows) - MAX_ROWS} more (--json shows all)")
+
+
+def print_table_two(rows: list[dict[str, Any]]) -> None:
+    """The paper's Table II, ours and the paper's: root mean squares, px / mm."""
+    pairs = [
+        {
+            "px / mm": row["row"],
+            **{name: _pair(row, key) for name, key in TABLE_TWO.items()},
+        }
+        for row in rows
+    ]
+    print_table("Table II: light against ink", pairs)
+
+
+TABLE_TWO = {"training": "training", "held out": "held_out", "true": "true", "the paper": "paper"}
+
+
+def _pair(row: dict[str, Any], key: str) -> str:
+    px, mm = row.get(f"{key}_px"), row.get(f"{key}_mm")
+    return "-" if px is None or mm is None else f"{px:.2f} / {mm:.2f}"
 
 
 def short(value: Any) -> str:
