@@ -18,6 +18,8 @@ from cellctl.sim.paper import ALWAYS, Ink, Line, Sheet, printed
 from cellctl.sim.truth import Truth
 
 NONE = np.zeros(3)
+NEAR_M = 0.05
+"""A tip that is higher than this over the table touches nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,10 @@ class Pen:
             xy = table.pose.inverse().apply(hits)[:, :2]
             depth = ((tips - hits) * axes).sum(axis=1)
             off = ~(np.abs(xy) <= table.half_top).all(axis=1) | ~(axes[:, 2] < 0)
+        # A pen that lies nearly flat meets the table's surface far from its tip, or its parabola
+        # where there is no table: it touches only what its tip is near to.
+        places = table.pose.inverse().apply(tips)
+        off |= places[:, 2] - table.height(places[:, :2]) > NEAR_M
         depth[off] = -np.inf
         return Press(t, xy, depth)
 

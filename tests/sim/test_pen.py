@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cellctl.errors import DeviceFault, MotionRefused, NotFound
 from cellctl.sim import mishaps, pendant
 from cellctl.sim.drawn import drawn
 from cellctl.sim.grid import touched_height
 from cellctl.sim.motion import TICK_S
+from cellctl.sim.pen import Pen
 from cellctl.sim.presets import CR
 from cellctl.sim.shrink import fitted_circle
 from cellctl.sim.truth import draw
@@ -403,3 +405,15 @@ def test_old_ink_is_forgotten_only_when_nobody_can_see_it(world):
         pass
     world.advance(world.now + 200.0)
     assert world.arm.pen.ink(world.now) == ()
+
+
+def test_a_pen_that_lies_flat_high_over_the_table_touches_nothing():
+    """Its axis meets the bowed table's parabola, but far from the tip."""
+    truth = draw(CR, 2)
+    pen = Pen(truth)
+    frames = np.tile(np.eye(4), (50, 7, 1, 1))
+    tilts = np.radians(np.linspace(89.0, 91.0, 50))
+    turns = Rotation.from_euler("x", np.pi - tilts).as_matrix()
+    frames[:, 6, :3, :3] = turns
+    frames[:, 6, :3, 3] = (-0.18, 0.05, 0.93)
+    assert (pen.press(np.arange(50.0), frames).depth == -np.inf).all()
