@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ from cellctl.sim.truth import Truth
 SERVO_SIGMA_RAD = 1e-5
 """How far from the target the servos come to rest; the encoders see it."""
 HISTORY_S = 60.0
+STRAIGHT_STEPS = 40
+"""In which a way is looked at beforehand."""
 GRAZE_M = 1e-3
 """An arm that was stopped by a contact may move on if the overlap does not grow by more."""
 
@@ -114,14 +117,17 @@ class Arm:
     def draw(
         self, now: float, waypoints: Array, limits: Limits, index: str, share: float = 1.0
     ) -> float:
-        """Start a stroke; returns when it ends. Ink flows for `share` of its way on paper."""
+        """Start a stroke; returns when it ends. Ink flows for `share` of its way on paper. One
+        that begins with the pen on the paper belongs to the stroke before: it lifts the pen."""
         self._ready(now, waypoints)
         seed, preset = self._truth.seed, self._truth.preset
+        lifts_only = self.pen_is_down(now)
         self._trace(now, waypoints, limits, index)
         self.pen.way_left = np.inf
-        slipped = keyed(seed, "slip", index).normal(0.0, preset.pen_slip_sigma_m, 2)
-        self.pen.slip = np.array([*slipped, 0.0])
-        self.pen.stroke, self.pen.strokes = self.pen.strokes, self.pen.strokes + 1
+        if not lifts_only:
+            slipped = keyed(seed, "slip", index).normal(0.0, preset.pen_slip_sigma_m, 2)
+            self.pen.slip = np.array([*slipped, 0.0])
+            self.pen.stroke, self.pen.strokes = self.pen.strokes, self.pen.strokes + 1
         if share < 1.0:
             self.pen.weaken(self._press(now), share)
         return self._foresee(now)
@@ -251,6 +257,13 @@ class Arm:
         """Whether it touches the table."""
         t = np.array([now])
         return bool(self.pen.press(t, self._motion.frames(t)).depth[0] >= 0)
+
+    def is_clear(self, waypoints: Array) -> bool:
+        """Whether nothing would touch anything on straight joint ways through (n, 6)."""
+        shares = np.linspace(0.0, 1.0, STRAIGHT_STEPS)[:, None]
+        ways = [a + shares * (b - a) for a, b in itertools.pairwise(waypoints)]
+        gaps, _ = self._obstacles.gaps(self._truth.arm.link_frames(np.concatenate(ways)))
+        return bool((gaps > 0).all())
 
     def look_ahead(self, now: float) -> None:
         """Something has changed: see again where the motion leads, and what the pen writes."""
