@@ -13,7 +13,7 @@ trace of its part of the hat matrix.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -122,12 +122,13 @@ class _Back:
         return self._of_rows(wide, np.square(r), local)
 
     def of_local_prior(self, slopes: Array, off: Array, rows: slice) -> Information:
-        """Of `rows` of whitened residuals (n, 6) with derivatives (n, 6, 6) by the locals."""
+        """Of `rows` of whitened residuals (n, 6) with derivatives (n, 6, 6) by the locals; zero
+        for views of which nothing is known."""
         part, squares = slopes[:, rows], np.square(off[:, rows])
-        known = part.any(axis=(1, 2))
         wide = -part @ np.swapaxes(self.reduce, 1, 2)
         local = float(np.einsum("nki,nij,nkj->", part, self.inverse_C, part))
-        return self._of_rows(wide[known], squares[known], local)
+        found = self._of_rows(wide, squares, local)
+        return replace(found, rows=3 * int(part.any(axis=(1, 2)).sum()))
 
     def of_global_prior(self, off: Array, jacobian: Array) -> Information:
         return self._of_rows(jacobian[None], np.square(off), 0.0)
