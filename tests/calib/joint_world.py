@@ -15,6 +15,7 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.joint.observations import BoardViews, Circles, Lit, LitBoard, Observations
 from cellctl.calib.patterns import marker_pictures
 from cellctl.calib.projector_map import ProjectorMap, direct_linear_transform
+from cellctl.calib.refine_fit import rotations
 from cellctl.calib.table_surface import Area
 from cellctl.calib.targets import ArucoGrid, Chessboard
 from cellctl.calib.views import RobotView
@@ -258,9 +259,16 @@ def _start(truth: Truth, seen: Observations, grid: Grid, rng: Rng) -> Calibratio
     return Calibration(camera, pose, Plane.horizontal(grid.height), projector)
 
 
-def true_tcp(truth: Truth) -> Array:
-    """Offset (2,) of the pen in world axes at the drawing posture, metres."""
-    return (pose_matrix((np.pi, 0, 0), (0, 0, 0))[:3, :3] @ (truth.pen - truth.nominal_pen))[:2]
+def true_tcp(world: JointWorld) -> Array:
+    """The offset (2,), metres, that turns with the tool, as far as drawing shows it: beside the
+    pen's that of the last link."""
+    truth, grid = world.truth, world.grid
+    home = drawing_joints(truth, np.array([truth.preset.table.centre_m[:2]]), grid.height)[0]
+    yaw = np.radians([0.0, 60.0, -60.0, 30.0, -30.0])
+    xy = np.tile(truth.preset.table.centre_m[:2], (len(yaw), 1))
+    pen = truth.pen_lands(xy, _joints(truth, xy, yaw, grid.height, home))[:, :2]
+    design = np.concatenate([rotations(yaw), np.tile(np.eye(2), (len(yaw), 1, 1))], axis=2)
+    return np.linalg.lstsq(design.reshape(-1, 4), pen.reshape(-1), rcond=None)[0][:2]
 
 
 def true_pose_error(truth: Truth, pose: Array) -> Array:

@@ -39,6 +39,7 @@ OPINIONS = {
     "lit": Opinion(0.1, 1.0),
     "draw": Opinion(0.2, 8.0),
     "field": Opinion(0.2, 4.0),
+    "bend": Opinion(0.05, 4.0),
 }
 VIEWS = Opinion(0.1, 1.0)
 LEAST = 1e-3
@@ -161,8 +162,8 @@ def _of_priors(problem: JointProblem, state: JointState, back: _Back) -> dict[st
     for name, (off, slopes) in problem.global_priors(state).items():
         jacobian = np.zeros((len(off), count))
         jacobian[:, problem.layout.slices[name]] = slopes
-        if name == "field":
-            found["field"] = back.of_global_prior(off, jacobian)
+        if name in ("field", "bend", "robot", "look"):
+            found[name] = back.of_global_prior(off, jacobian)
         else:
             rest.append((off, jacobian))
     off, jacobian = (np.concatenate(parts) for parts in zip(*rest, strict=True))

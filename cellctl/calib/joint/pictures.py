@@ -37,8 +37,9 @@ def world_camera(state: JointState, look: Array) -> Array:
 
 
 def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Array) -> Picture:
-    """Of the pen, commanded to xy (n, 2) m; `turn` (n, 2, 2) is R(yaw) - 1."""
-    place = xy + turn @ state.tcp
+    """Of the pen, commanded to xy (n, 2) m with its tool turned by `turn` (n, 2, 2), R(yaw).
+    "place" stands for xy itself."""
+    place = xy + turn @ state.tcp[:2]
     T = world_camera(state, look)
     in_camera = transform_points(invert(T), state.table.points(place))
     plain, by_camera = _normalised(in_camera)
@@ -51,22 +52,31 @@ def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Ar
     in_plane = g[..., :2] + g[..., 2:] * state.table.slopes(place)[:, None]
     slopes = _of_camera_pose(state, by_plain @ by_camera, in_camera)
     slopes["table"] = g[..., 2:] * state.table.basis(place)[:, None]
-    slopes["tcp"] = in_plane @ turn
+    slopes["tcp"] = np.concatenate([in_plane @ turn, np.zeros((len(xy), 2, 1))], axis=-1)
     slopes["place"] = in_plane
     if field is not None:
-        values = field.values(plain)
-        both = values[:, None, :, None] * np.eye(2)[:, None, :]
-        slopes["field"] = both.reshape(len(xy), 2, -1)
+        slopes["field"] = field.slopes(plain)
     return Picture(seen, slopes)
 
 
-def light_on_table(state: JointState, look: Array, pixels: Array) -> Picture:
+def light_on_table(state: JointState, look: Array, field: Field | None, pixels: Array) -> Picture:
     """Of the light of projector pixels (n, 2)."""
     if isinstance(state.projector, ProjectorMap):
-        return _by_map(state.projector, pixels)
+        plain = _by_map(state.projector, pixels)
+    else:
+        plain = _by_rays(state, look, pixels)
+    if field is None:
+        return plain
+    bend = field.refinement(state.bend)
+    by_plain = bend.slopes(bend.scaled(plain.xy))
+    slopes = {name: by_plain @ slope for name, slope in plain.slopes.items()}
+    return Picture(bend.apply(plain.xy), {**slopes, "bend": field.slopes(plain.xy)})
+
+
+def _by_rays(state: JointState, look: Array, pixels: Array) -> Picture:
     T = world_camera(state, look)
-    ray = _Ray.of(state.projector, pixels)
-    points = state.table.hit(state.projector.pose[:3, 3], ray.directions)
+    ray = _Ray.of(state.full_projector, pixels)
+    points = state.table.hit(state.full_projector.pose[:3, 3], ray.directions)
     normals = np.column_stack([-state.table.slopes(points[:, :2]), np.ones(len(points))])
     in_camera = transform_points(invert(T), points)
     xy, by_camera = _normalised(in_camera)
@@ -86,7 +96,7 @@ def light_on_board(
     to_hand = bool(np.array_equal(chain.after[view], np.eye(4)))
     before, after = chain.before[view], chain.after[view]
     board_state = state.boards[board]
-    outer = before @ correction @ after
+    outer = state.robot_off @ before @ correction @ after
     T_world_board = (outer if to_hand else np.eye(4)) @ board_state.pose
     to_camera = invert(state.camera_pose) @ (np.eye(4) if to_hand else outer)
     ray = _Ray.of(state.full_projector, pixels)
@@ -105,7 +115,11 @@ def light_on_board(
     slopes |= _of_print(chain, board_state, board, on_board, along)
     by_points = along * (normals @ board_state.pose[:3, :3].T)[:, None]
     moved = transform_points(board_state.pose, on_board)
-    if not to_hand:
+    if to_hand:
+        by_robot = along * (world_normals @ state.robot_off[:3, :3])[:, None]
+        in_base = transform_points(invert(state.robot_off), points)
+        slopes["robot"] = derivatives_by_pose(by_robot, in_base)
+    else:
         by_points = by_camera @ (invert(state.camera_pose) @ correction)[:3, :3]
         moved = transform_points(after, points)
     return Picture(xy, slopes, derivatives_by_pose(by_points, moved))

@@ -8,18 +8,23 @@ from functools import cached_property
 
 import numpy as np
 
-from cellctl.calib.chain import SCALE_SIGMA, WARP_SIGMA, Chain, ChainState
+from cellctl.calib.chain import SCALE_SIGMA, WARP_SIGMA, Chain, ChainState, PosePrior
 from cellctl.calib.joint.observations import Circles, Lit, LitBoard
 from cellctl.calib.joint.pictures import Picture, light_on_board, light_on_table, pen
 from cellctl.calib.joint.state import Field, FullProjector, JointState, Layout
-from cellctl.calib.pose import pose_vector_derivatives, pose_vectors
+from cellctl.calib.pose import adjoint, pose_vector_derivatives, pose_vectors
 from cellctl.calib.refine_fit import TCP_PRIOR_MM, rotations
 from cellctl.calib.schur import Linearised, Priors
-from cellctl.geometry import Array
+from cellctl.geometry import Array, invert
 
 CENTRE_SIGMA_PX, RADIAL_SIGMA, FOCAL_SIGMA = 15.0, 0.1, 0.1
 """Of a projector, before anything was seen: its centre about the data sheet's, k1 and k2, and,
 where it is free, the focal length's logarithm."""
+TCP_HEIGHT_MM = 1.0
+"""Of the pen's length."""
+ROBOT_COMMON = 2.0
+"""A robot's error is smooth: what all views share is as large as what scatters between them, and
+more. In standard deviations of the latter."""
 TABLE_SIGMA_M = (5e-3, 5e-3, 5e-3, 2e-3, 2e-3, 2e-3)
 """Of the table's coefficients about the start's, where nobody touched it: in the middle, by what
 the edges tilt, and by what they bow."""
@@ -42,7 +47,7 @@ class ViewGroup:
         board, one = state.boards[self.board], np.eye(4)
         return ChainState(
             camera=state.camera,
-            camera_pose=one if self.free_pose else state.camera_pose,
+            camera_pose=one if self.free_pose else invert(state.robot_off) @ state.camera_pose,
             board_pose=one if self.free_pose else board.pose,
             corrections=state.corrections[self.views],
             log_scale=0.0 if self.free_pose else board.log_scale,
@@ -61,8 +66,8 @@ class LensPrior:
 @dataclass(frozen=True, eq=False)
 class JointProblem:
     """See schur.Problem. `sigma` holds the noises by the name of their group: "<views>" in px,
-    "turn" in rad, "shift" in m, "touch" in m, "markers" and "lit" in px, "draw" in mm, "field" in
-    mm. `mm` (n, 2, 2): millimetres on the table by a camera pixel, at the circles."""
+    "turn" in rad, "shift" in m, "touch" in m, "markers" and "lit" in px, "draw", "field" and
+    "bend" in mm. `mm` (n, 2, 2): millimetres on the table by a camera pixel, at the circles."""
 
     layout: Layout
     groups: tuple[ViewGroup, ...]
@@ -82,8 +87,8 @@ class JointProblem:
 
     @cached_property
     def turn(self) -> Array:
-        """R(yaw) - 1 (n, 2, 2) of the circles."""
-        return rotations(self.circles.yaw) - np.eye(2)
+        """R(yaw) (n, 2, 2) of the circles."""
+        return rotations(self.circles.yaw)
 
     @cached_property
     def lit_places(self) -> list[tuple[ViewGroup, int]]:
@@ -116,7 +121,7 @@ class JointProblem:
         if len(self.touches):
             found["touch"] = self._touches(state)
         if len(self.markers):
-            picture = light_on_table(state, self.look, self.markers.projector_px)
+            picture = light_on_table(state, self.look, self.field, self.markers.projector_px)
             found["markers"] = self._pictured(
                 state, picture, self.markers.camera_px, np.eye(2) / self.sigma["markers"]
             )
@@ -131,20 +136,32 @@ class JointProblem:
 
     def _views(self, group: ViewGroup, state: JointState) -> Linearised:
         linear = group.chain.linearise(group.chain_state(state))
+        by_globals, columns = linear.by_globals, group.columns
+        if "robot" in self.layout and not group.free_pose:
+            start = len(group.chain.free.intrinsics)
+            by_robot = linear.by_globals[..., start : start + 6] @ -adjoint(
+                invert(state.camera_pose) @ state.robot_off
+            )
+            by_globals = np.concatenate([by_globals, by_robot], axis=-1)
+            columns = np.concatenate([columns, self.layout.columns(["robot"])])
         weight = 1.0 / self.sigma[group.name]
         return Linearised(
             linear.residuals * weight,
-            linear.by_globals * weight,
+            by_globals * weight,
             linear.by_locals * weight,
-            group.columns,
+            columns,
             group.views,
         )
 
     def _touches(self, state: JointState) -> Linearised:
         xy, z = self.touches[:, :2], self.touches[:, 2]
-        off = (state.table.height(xy) - z) / self.sigma["touch"]
-        slopes = state.table.basis(xy)[None, :, None] / self.sigma["touch"]
-        columns = self.layout.columns(["table"])
+        off = (state.table.height(xy) - state.tcp[2] - z) / self.sigma["touch"]
+        slopes, names = state.table.basis(xy), ["table"]
+        if "tcp" in self.layout:
+            slopes = np.column_stack([slopes, np.zeros((len(z), 2)), -np.ones(len(z))])
+            names.append("tcp")
+        slopes = slopes[None, :, None] / self.sigma["touch"]
+        columns = self.layout.columns(names)
         return Linearised(off[None, :, None], slopes, slopes[..., :0], columns, slice(0, 0))
 
     def _lit(self, state: JointState, one: LitBoard, group: ViewGroup, view: int) -> Linearised:
@@ -207,16 +224,19 @@ class JointProblem:
             if name in self.layout:
                 found[name] = (off / sigma, np.diag(1.0 / np.broadcast_to(sigma, off.shape)))
 
-        add("tcp", state.tcp, np.full(2, 1e-3 * TCP_PRIOR_MM))
+        add("tcp", state.tcp, 1e-3 * np.array([TCP_PRIOR_MM, TCP_PRIOR_MM, TCP_HEIGHT_MM]))
         off = state.table.coefficients - self.table_start
         add("table", off, np.array(TABLE_SIGMA_M[: len(off)]))
-        add("look", pose_vectors(state.look_off[None])[0], self.robot_sigma)
+        common = ROBOT_COMMON * self.robot_sigma
+        for name, off_pose in (("robot", state.robot_off), ("look", state.look_off)):
+            if name in self.layout:
+                found[name] = PosePrior(np.eye(4), common).whitened(off_pose)
         for name, board in state.boards.items():
             add(f"{name} scale", np.array([board.log_scale]), np.array([SCALE_SIGMA]))
             half = max(float(g.chain.sheet.half.max()) for g in self.groups if g.board == name)
             add(f"{name} warp", board.warp, np.full(3, WARP_SIGMA * half))
-        if self.field is not None:
-            add("field", state.field.reshape(-1), np.full(state.field.size, self.sigma["field"]))
+        for name, values in (("field", state.field), ("bend", state.bend)):
+            add(name, values.reshape(-1), np.full(values.size, self.sigma[name]))
         if "projector" in self.layout and self.lens is not None:
             found["projector"] = self._projector_prior(state, self.lens)
         return found

@@ -94,10 +94,12 @@ def begin(
         camera_pose=camera_pose,
         boards={n: BoardState(one.board_pose, 0.0, np.zeros(3)) for n, one in boards.items()},
         table=Table.of_plane(start.table, area or _area(seen, start), options.table),
-        projector=start.projector,
-        tcp=np.zeros(2),
+        projector=replace(start.projector, bend=None),
+        tcp=np.zeros(3),
         field=np.zeros((0, 2)),
+        bend=np.zeros((0, 2)),
         corrections=np.concatenate([np.zeros((0, 4, 4)), *(one.corrections for one in located)]),
+        robot_off=np.eye(4),
         look_off=np.eye(4),
     )
     lens = _lens_prior(start.projector)
@@ -115,9 +117,10 @@ def _problem(
     options: JointOptions,
 ) -> tuple[JointProblem, JointState]:
     field = None
-    if len(seen.circles) and options.field:
+    if options.field:
         field = _field(state, look, options.field_length)
-        state = replace(state, field=np.zeros((field.count, 2)))
+        nothing = np.zeros((field.count, 2))
+        state = replace(state, field=nothing, bend=nothing)
     layout = _layout(seen, state, located, options, lens)
     groups = _groups(layout, located, options)
     problem = JointProblem(
@@ -218,8 +221,10 @@ def _layout(
     if len(seen.markers) or seen.lit_boards:
         full = isinstance(state.projector, FullProjector)
         sizes["projector"] = 11 if full else 8 if lens is None else 12
+        sizes["bend"] = state.bend.size if len(seen.markers) else 0
     if len(seen.circles):
-        sizes |= {"tcp": 2, "field": state.field.size}
+        sizes |= {"tcp": 3, "field": state.field.size}
+        sizes["robot"] = 6 * (bool(tied) and seen.mount == "eye-to-hand")
     sizes["look"] = 6 * (seen.look is not None and on_table)
     return Layout({name: size for name, size in sizes.items() if size})
 
@@ -252,8 +257,7 @@ def _groups(
 def _mm(state: JointState, look: Array, seen: Observations) -> Array:
     """(n, 2, 2) millimetres on the table by a camera pixel at the circles."""
     circles = seen.circles
-    turn = rotations(circles.yaw) - np.eye(2)
-    picture = pen(state, look, None, circles.xy, turn)
+    picture = pen(state, look, None, circles.xy, rotations(circles.yaw))
     if not np.isfinite(picture.xy).all():
         raise SolveError("circles lie behind the camera: its pose is wrong")
     flat = np.column_stack([picture.xy, np.ones(len(circles))])
@@ -265,7 +269,7 @@ def _field(state: JointState, look: Array, length: float) -> Field:
     low, high = state.table.area.low, state.table.area.high
     steps = np.stack(np.meshgrid(*[np.linspace(-1, 1, GRID)] * 2), axis=-1).reshape(-1, 2)
     xy = (low + high) / 2 + steps * (high - low) / 2
-    picture = pen(state, look, None, xy, np.zeros((len(xy), 2, 2)))
+    picture = pen(state, look, None, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)))
     least, most = picture.xy.min(axis=0), picture.xy.max(axis=0)
     scale = float((most - least).max()) / 2
     mm = 1e3 * scale / float(np.sqrt(np.abs(np.linalg.det(picture.slopes["place"])).mean()))

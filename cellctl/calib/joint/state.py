@@ -103,7 +103,7 @@ class FullProjector:
 @dataclass(frozen=True, eq=False)
 class Field:
     """Smooth displacements in the camera's plane that no parameter explains: what the arm's
-    kinematic errors and the table's bow do to drawn circles. A Gaussian process with the kernel
+    kinematic errors do to drawn circles, and the table's bow to light. A Gaussian process with the kernel
     exp(-r^2 / 2 length^2), r in units of `scale` about `centre`, written as `modes` (k, m)
     of the radial functions about `nodes` (k, 2): Rasmussen, Williams, Gaussian Processes for
     Machine Learning, 2006, section 8.1. `mm`: millimetres on the table of one `scale`."""
@@ -125,6 +125,11 @@ class Field:
         phi = kernel_values("rbf", self.length, u, self.nodes)
         return phi @ self.modes * (self.scale / self.mm)
 
+    def slopes(self, xy: Array) -> Array:
+        """`values` as derivatives (n, 2, 2 m) of both coordinates by all coefficients."""
+        both = self.values(xy)[:, None, :, None] * np.eye(2)[:, None, :]
+        return both.reshape(len(xy), 2, -1)
+
     def refinement(self, coefficients: Array) -> Refinement:
         """The displacement with coefficients (m, 2) in mm, as calibrations store it."""
         weights = self.modes @ coefficients / self.mm
@@ -141,9 +146,14 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class JointState:
-    """`camera_pose` is T_anchor_camera, the anchor being the world or the flange; `look` the
-    T_world_anchor at which the table was pictured, with `look_off` (4, 4) what the robot was off.
-    `tcp` (2,) m in world axes at yaw 0; `field` (m, 2) mm; `corrections` (n, 4, 4) of all views.
+    """`camera_pose` is T_anchor_camera, the anchor being the world or the flange.
+
+    `tcp` (3,) m, how far the pen's tip is from where it is believed, in world axes at yaw 0;
+    `field` and `bend` (m, 2) mm, the smooth displacements of what is drawn and of what is lit;
+    `corrections` (n, 4, 4) of all views. `robot_off` (4, 4) is how far the robot is off in all
+    views alike, against where it is off at the table: T_world_flange = robot_off @ reported @
+    correction. With the camera on the arm, `look_off` (4, 4) is how far it was off as it looked at
+    the table: T_world_flange = reported @ look_off.
     """
 
     camera: CameraModel
@@ -153,7 +163,9 @@ class JointState:
     projector: ProjectorMap | FullProjector
     tcp: Array
     field: Array
+    bend: Array
     corrections: Array
+    robot_off: Array
     look_off: Array
 
     @property
@@ -202,9 +214,11 @@ class Layout:
             projector=_moved_projector(state.projector, part.get("projector")),
             tcp=state.tcp + part.get("tcp", 0.0),
             field=state.field + np.reshape(part.get("field", 0.0), (-1, 2)),
+            bend=state.bend + np.reshape(part.get("bend", 0.0), (-1, 2)),
             corrections=state.corrections @ pose_matrices(by_locals)
             if by_locals.size
             else state.corrections,
+            robot_off=moved_pose(state.robot_off, part.get("robot")),
             look_off=moved_pose(state.look_off, part.get("look")),
         )
 

@@ -25,6 +25,9 @@ SOURCES = {
     "lit": "projector",
     "draw": "drawing",
     "field": "arm",
+    "robot": "arm",
+    "look": "arm",
+    "bend": "projector",
     "prior": "prior",
 }
 """What the noise of a group of observations is called in a budget. Views have their own names,
@@ -83,8 +86,9 @@ def map_slopes(result: JointResult, points: Array) -> Array:
     for world places (n, 2) lands from where the pen stands."""
     state, problem = result.state, result.problem
     xy = np.asarray(points, dtype=float)[:, :2]
-    drawn = pen(state, problem.look, problem.field, xy, np.zeros((len(xy), 2, 2)))
-    lit = light_on_table(state, problem.look, result.calibration.project(xy))
+    drawn = pen(state, problem.look, problem.field, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)))
+    pixels = result.calibration.project(xy)
+    lit = light_on_table(state, problem.look, problem.field, pixels)
     J = np.zeros((len(xy), 2, problem.layout.count))
     for sign, picture in ((-1.0, drawn), (1.0, lit)):
         for name, slopes in picture.slopes.items():
