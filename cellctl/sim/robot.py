@@ -9,7 +9,7 @@ import numpy as np
 
 from cellctl.arms import JOINTS
 from cellctl.errors import DeviceFault, MotionRefused
-from cellctl.geometry import Array
+from cellctl.geometry import Array, Mask
 from cellctl.sim.contact import Obstacles
 from cellctl.sim.motion import RING_S, TICK_S, Limits, Motion
 from cellctl.sim.noise import keyed
@@ -262,7 +262,7 @@ class Arm:
         """Whether nothing would touch anything on straight joint ways through (n, 6)."""
         shares = np.linspace(0.0, 1.0, STRAIGHT_STEPS)[:, None]
         ways = [a + shares * (b - a) for a, b in itertools.pairwise(waypoints)]
-        gaps, _ = self._obstacles.gaps(self._truth.arm.link_frames(np.concatenate(ways)))
+        gaps = self._obstacles.gaps(self._truth.arm.link_frames(np.concatenate(ways)))
         return bool((gaps > 0).all())
 
     def look_ahead(self, now: float) -> None:
@@ -315,19 +315,19 @@ class Arm:
     def _touches_at(self, now: float) -> Event | None:
         """The first contact of anything else with anything."""
         times = np.arange(now, self._motion.standstill_at() + TICK_S, TICK_S)
-        gaps, pairs = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
+        gaps = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
         limit = np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
         reach = NEAR_STROKE_M if self._stroking else NEAR_M
-        near = np.repeat((gaps < limit + reach).any(axis=1), COARSE)
-        around = np.convolve(near, np.ones(2 * COARSE + 1), "same")[: len(times)] > 0
-        if not around.any():
+        near = gaps < limit + reach
+        which, times = near.any(axis=0), times[_around(near.any(axis=1), len(times))]
+        if not len(times):
             return None
-        times = times[around]
-        gaps, pairs = self._obstacles.gaps(self._motion.frames(times))
+        gaps, limit = self._obstacles.gaps(self._motion.frames(times), which), limit[which]
         touching = gaps < limit
         if not touching.any():
             return None
         first = int(touching.any(axis=1).argmax())
+        pairs = [pair for pair, wanted in zip(self._obstacles.pairs, which, strict=True) if wanted]
         pair = pairs[int(np.where(touching[first], gaps[first], np.inf).argmin())]
         return Event(float(times[first]), pair, f"{pair[0]} touched {pair[1]}")
 
@@ -342,3 +342,9 @@ class Arm:
         first, last = max(near[0] - 1, 0), min(near[-1] + 1, len(coarse) - 1)
         t = np.arange(coarse[first], coarse[last] + WRITING_S / 2, WRITING_S)
         return self.pen.press(t, self._motion.frames(t))
+
+
+def _around(coarse: Mask, count: int) -> Mask:
+    """Which of `count` ticks are close to those of every COARSE ticks that are marked."""
+    every = np.repeat(coarse, COARSE)
+    return np.asarray(np.convolve(every, np.ones(2 * COARSE + 1), "same")[:count] > 0)
