@@ -21,7 +21,10 @@ WIDTH, HEIGHT = 420.0, 280.0
 FAINTEST, STRONGEST = 0.06, 0.9
 BAR, NAMES = 22.0, 110.0
 CURVES = (("predicted_mm", "train", "predicted"), ("held_out_mm", "held", "held out"))
-LEGEND = (("dot train", "predicted"), ("dot held", "measured on circles held out"))
+LEGEND = (
+    ("dot train", "predicted"),
+    ("dot held", "measured on circles held out, whose own scatter adds to it"),
+)
 
 
 def section(recorded: Recorded) -> Section:
