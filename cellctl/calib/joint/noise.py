@@ -162,7 +162,7 @@ def _of_priors(problem: JointProblem, state: JointState, back: _Back) -> dict[st
     for name, (off, slopes) in problem.global_priors(state).items():
         jacobian = np.zeros((len(off), count))
         jacobian[:, problem.layout.slices[name]] = slopes
-        if name in ("field", "bend", "robot", "look"):
+        if name in ("field", "bend", "robot", "look", "level"):
             found[name] = back.of_global_prior(off, jacobian)
         else:
             rest.append((off, jacobian))

@@ -91,7 +91,7 @@ class JointResult:
             return None
         field, table = self.problem.field, plain.table_homography
         shift = np.eye(3)
-        shift[:2, 2] = self.state.tcp[:2]
+        shift[:2, 2] = self.state.tcp
         H = table @ shift @ np.linalg.inv(table)
         if field is None:
             return Refinement("joint", H=H / H[2, 2])
@@ -110,7 +110,7 @@ class JointResult:
 
     def _bend(self, plain: ProjectorMap) -> Refinement | None:
         """From where `plain` has a pixel's light to where it is seen."""
-        field = self.problem.field
+        field = self.problem.bend
         if field is None or not self.state.bend.size:
             return None
         found = field.refinement(self.state.bend)
@@ -118,7 +118,7 @@ class JointResult:
             return found
         world = self.state.table.points(self.places)
         pixels = self.state.projector.project(world)
-        exact = light_on_table(self.state, self.problem.look, field, pixels).xy
+        exact = light_on_table(self.state, self.problem.look, self.problem.bend, pixels).xy
         at = plain.locate(pixels)
         return replace(found, weights=found.weights + _weights(found, at, exact - found.apply(at)))
 

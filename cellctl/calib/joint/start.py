@@ -26,8 +26,8 @@ from cellctl.calib.views import Batch, RobotView
 from cellctl.errors import BadInput, SolveError
 from cellctl.geometry import Array, invert, transform_points
 
-FIELD_LENGTH = 1.5
-"""Of the smooth displacements, in half the drawn area's longer side."""
+FIELD_LENGTH, BEND_LENGTH = 0.8, 1.5
+"""Of the smooth displacements of what is drawn and lit, in half the drawn area's longer side."""
 FIELD_NODES, FIELD_REACH = 7, 1.3
 NEGLIGIBLE_MODE = 1e-4
 """Modes whose variance is below that part of the largest are left out."""
@@ -39,13 +39,13 @@ GRID = 11
 @dataclass(frozen=True)
 class JointOptions:
     """What the adjustment may change. `table`: the kind of surface (table_surface.TERMS);
-    `field`: smooth displacements of drawn circles, of `field_length` half sides of the area."""
+    `smooth`: displacements of what is drawn, of `field_length` half sides of the area, and lit."""
 
     camera: bool = True
     scale: bool = True
     warp: bool = True
     table: str = "plane"
-    field: bool = True
+    smooth: bool = True
     field_length: float = FIELD_LENGTH
 
 
@@ -95,7 +95,8 @@ def begin(
         boards={n: BoardState(one.board_pose, 0.0, np.zeros(3)) for n, one in boards.items()},
         table=Table.of_plane(start.table, area or _area(seen, start), options.table),
         projector=replace(start.projector, bend=None),
-        tcp=np.zeros(3),
+        tcp=np.zeros(2),
+        level=np.zeros(3),
         field=np.zeros((0, 2)),
         bend=np.zeros((0, 2)),
         corrections=np.concatenate([np.zeros((0, 4, 4)), *(one.corrections for one in located)]),
@@ -116,11 +117,13 @@ def _problem(
     lens: LensPrior | None,
     options: JointOptions,
 ) -> tuple[JointProblem, JointState]:
-    field = None
-    if options.field:
+    field = bend = None
+    if options.smooth and len(seen.circles):
         field = _field(state, look, options.field_length)
-        nothing = np.zeros((field.count, 2))
-        state = replace(state, field=nothing, bend=nothing)
+        state = replace(state, field=np.zeros((field.count, 2)))
+    if options.smooth and len(seen.markers):
+        bend = _field(state, look, BEND_LENGTH)
+        state = replace(state, bend=np.zeros((bend.count, 2)))
     layout = _layout(seen, state, located, options, lens)
     groups = _groups(layout, located, options)
     problem = JointProblem(
@@ -133,6 +136,7 @@ def _problem(
         mm=_mm(state, look, seen),
         look=look,
         field=field,
+        bend=bend,
         lens=lens,
         table_start=state.table.coefficients,
         sigma={group.name: VIEWS.sigma for group in groups}
@@ -218,12 +222,13 @@ def _layout(
         sizes[f"{board} scale"] = 1 * (options.scale and board in tied)
         sizes[f"{board} warp"] = 3 * options.warp
     sizes["table"] = TERMS[options.table] * (on_table or bool(len(seen.touches)))
+    sizes["level"] = 3 * bool(len(seen.touches))
     if len(seen.markers) or seen.lit_boards:
         full = isinstance(state.projector, FullProjector)
         sizes["projector"] = 11 if full else 8 if lens is None else 12
-        sizes["bend"] = state.bend.size if len(seen.markers) else 0
+        sizes["bend"] = state.bend.size
     if len(seen.circles):
-        sizes |= {"tcp": 3, "field": state.field.size}
+        sizes |= {"tcp": 2, "field": state.field.size}
         sizes["robot"] = 6 * (bool(tied) and seen.mount == "eye-to-hand")
     sizes["look"] = 6 * (seen.look is not None and on_table)
     return Layout({name: size for name, size in sizes.items() if size})

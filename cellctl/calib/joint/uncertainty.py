@@ -28,6 +28,7 @@ SOURCES = {
     "robot": "arm",
     "look": "arm",
     "bend": "projector",
+    "level": "plane",
     "prior": "prior",
 }
 """What the noise of a group of observations is called in a budget. Views have their own names,
@@ -88,7 +89,7 @@ def map_slopes(result: JointResult, points: Array) -> Array:
     xy = np.asarray(points, dtype=float)[:, :2]
     drawn = pen(state, problem.look, problem.field, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)))
     pixels = result.calibration.project(xy)
-    lit = light_on_table(state, problem.look, problem.field, pixels)
+    lit = light_on_table(state, problem.look, problem.bend, pixels)
     J = np.zeros((len(xy), 2, problem.layout.count))
     for sign, picture in ((-1.0, drawn), (1.0, lit)):
         for name, slopes in picture.slopes.items():
