@@ -97,7 +97,7 @@ class JointFit(Fit):
     @property
     def freedom(self) -> float:
         assert self.result is not None
-        return self.result.information["draw"].redundancy
+        return self.result.components["draw"].redundancy
 
     def predict(self, marks: Marks) -> Array:
         assert self.result is not None

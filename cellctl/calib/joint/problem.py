@@ -206,13 +206,18 @@ class JointProblem:
             jacobian[:, self.layout.slices[name]] = slopes
             rows.append(off)
             jacobians.append(jacobian)
+        return Priors(np.concatenate(rows), np.concatenate(jacobians), *self.local_priors(state))
+
+    def local_priors(self, state: JointState) -> tuple[Array, Array]:
+        """Whitened residuals (n, 6) of the views' corrections, and derivatives (n, 6, 6); zero
+        where the robot says nothing."""
         vectors = pose_vectors(state.corrections) / self.robot_sigma
         slopes = pose_vector_derivatives(state.corrections) / self.robot_sigma[:, None]
         for group in self.groups:
             if group.free_pose:
                 vectors[group.views] = 0.0
                 slopes[group.views] = 0.0
-        return Priors(np.concatenate(rows), np.concatenate(jacobians), vectors, slopes)
+        return vectors, slopes
 
     def global_priors(self, state: JointState) -> dict[str, tuple[Array, Array]]:
         """Whitened residuals (r,) and derivatives (r, c) of what is known beforehand, by the
@@ -226,7 +231,7 @@ class JointProblem:
         add("tcp", state.tcp, np.full(2, 1e-3 * TCP_PRIOR_MM))
         half = (state.table.area.high - state.table.area.low) / 2
         edges = ROBOT_COMMON * self.sigma["turn"] * half
-        add("level", state.level, np.array([PEN_LENGTH_SIGMA_M, *edges]))
+        add("level", state.level, np.append(PEN_LENGTH_SIGMA_M, edges))
         off = state.table.coefficients - self.table_start
         add("table", off, np.array(TABLE_SIGMA_M[: len(off)]))
         common = ROBOT_COMMON * self.robot_sigma

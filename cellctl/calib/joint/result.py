@@ -10,7 +10,7 @@ import numpy as np
 
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.homography import apply_homography
-from cellctl.calib.joint.noise import Information
+from cellctl.calib.joint.noise import Component, components, information
 from cellctl.calib.joint.observations import Observations
 from cellctl.calib.joint.pictures import light_on_table, pen, world_camera
 from cellctl.calib.joint.problem import JointProblem
@@ -25,12 +25,21 @@ GRID = 11
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """`information` by group of observations, see `noise.information`."""
+    """What was seen, where the adjustment began, and where it ended."""
 
     seen: Observations
     start: Calibration
     solution: Solution[JointState]
-    information: Mapping[str, Information]
+
+    @cached_property
+    def components(self) -> Mapping[str, Component]:
+        """Squares and redundancy of each group of observations."""
+        return components(self.solution)
+
+    @cached_property
+    def information(self) -> Mapping[str, Array]:
+        """What each unit of each group tells about the globals, see `noise.information`."""
+        return information(self.solution)
 
     @property
     def problem(self) -> JointProblem:
@@ -48,7 +57,7 @@ class JointResult:
     @property
     def sigma(self) -> Mapping[str, float]:
         """Noise of each group of observations, units as in JointProblem."""
-        return {n: s for n, s in self.problem.sigma.items() if n in self.information}
+        return {n: s for n, s in self.problem.sigma.items() if n in self.components}
 
     @cached_property
     def covariance(self) -> Array:

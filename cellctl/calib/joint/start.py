@@ -152,14 +152,16 @@ def _located(
     every = [v for g in seen.views if g.board == group.board for v in g.views]
     sheet = Sheet.of(np.concatenate([view.points for view in every]))
     before, after = _robot(group, seen.mount)
-    possible = [[pose.matrix for pose in board_poses(view, camera)] for view in group.views]
+    possible = [
+        [pose.matrix for pose in board_poses(view, camera, refine=False)] for view in group.views
+    ]
     if not group.through_robot:
         best = np.stack([poses[0] for poses in possible])
         return Located(group, best, np.eye(4), before, after, sheet)
     chain = zip(before, after, possible, strict=True)
     on_mount = [[invert(b @ f) @ camera_pose @ T for T in poses] for b, f, poses in chain]
     board_pose = _middle_pose(on_mount)
-    nearest = [int(np.argmin([_apart(board_pose, T) for T in poses])) for poses in on_mount]
+    nearest = [int(np.argmin(_apart(board_pose, np.stack(poses)))) for poses in on_mount]
     in_camera = np.stack([poses[i] for poses, i in zip(possible, nearest, strict=True)])
     return Located(group, in_camera, board_pose, before, after, sheet)
 
@@ -175,15 +177,16 @@ def _robot(group: BoardViews, mount: Mount) -> tuple[Array, Array]:
 
 def _middle_pose(options: Sequence[Sequence[Array]]) -> Array:
     """The one of all poses that is nearest to the nearest of each view's."""
-    every = [pose for poses in options for pose in poses]
-    total = [sum(min(_apart(one, other) for other in poses) for poses in options) for one in every]
+    every = np.concatenate([np.stack(poses) for poses in options])
+    total = sum(_apart(every[:, None], np.stack(poses)).min(axis=1) for poses in options)
     return np.asarray(every[int(np.argmin(total))])
 
 
-def _apart(one: Array, other: Array) -> float:
-    """Metres, a radian counting as one: the distance of poses, both of a size that boards have."""
-    turned = np.linalg.norm(one[:3, :3] - other[:3, :3]) / np.sqrt(2.0)
-    return float(np.linalg.norm(one[:3, 3] - other[:3, 3]) + turned)
+def _apart(one: Array, other: Array) -> Array:
+    """Metres, a radian counting as one: the distance (...) of poses (..., 4, 4)."""
+    off = one - other
+    turned = np.sqrt(np.square(off[..., :3, :3]).sum(axis=(-2, -1)) / 2.0)
+    return np.asarray(np.linalg.norm(off[..., :3, 3], axis=-1) + turned)
 
 
 def _lens_prior(projector: ProjectorMap) -> LensPrior | None:

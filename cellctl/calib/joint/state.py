@@ -103,10 +103,10 @@ class FullProjector:
 @dataclass(frozen=True, eq=False)
 class Field:
     """Smooth displacements in the camera's plane that no parameter explains: what the arm's
-    kinematic errors do to drawn circles, and the table's bow to light. A Gaussian process with the kernel
-    exp(-r^2 / 2 length^2), r in units of `scale` about `centre`, written as `modes` (k, m)
-    of the radial functions about `nodes` (k, 2): Rasmussen, Williams, Gaussian Processes for
-    Machine Learning, 2006, section 8.1. `mm`: millimetres on the table of one `scale`."""
+    kinematic errors do to drawn circles, and the table's bow to light. A Gaussian process with
+    the kernel exp(-r^2 / 2 length^2), r in units of `scale` about `centre`, written as `modes`
+    (k, m) of the radial functions about `nodes` (k, 2): Rasmussen, Williams, Gaussian Processes
+    for Machine Learning, 2006, section 8.1. `mm`: millimetres on the table of one `scale`."""
 
     centre: Array
     scale: float

@@ -130,14 +130,14 @@ def data(result: JointResult) -> dict[str, Array]:
     globals: (u, g, g). Views go by the name of their group, with the robot's word on them."""
     found = {}
     for group in result.problem.groups:
-        units = result.information[group.name].reduced.copy()
+        units = result.information[group.name].copy()
         for name in ("turn", "shift"):
-            units += result.information[name].reduced[group.views]
+            units += result.information[name][group.views]
         found[group.name] = units
     kinds = {"touch": "touches", "markers": "markers", "lit": "lit boards", "draw": "circles"}
     for name, kind in kinds.items():
         if name in result.information:
-            found[kind] = result.information[name].reduced
+            found[kind] = result.information[name]
     return found
 
 
@@ -146,7 +146,7 @@ def _by_source(result: JointResult) -> dict[str, Array]:
     for name, source in SOURCES.items():
         if name in result.information:
             before = found.get(source, 0.0)
-            found[source] = before + result.information[name].total
+            found[source] = before + result.information[name].sum(axis=0)
     return found
 
 
@@ -162,7 +162,7 @@ def _with_tcp(result: JointResult, J: Array, parts: dict[str, Array]) -> dict[st
 
 def _normal(result: JointResult) -> Array:
     """The Schur complement (g, g): what all data tell about the globals."""
-    return np.asarray(sum(one.total for one in result.information.values()))
+    return np.asarray(sum(one.sum(axis=0) for one in result.information.values()))
 
 
 def _spread(J: Array, covariance: Array) -> Array:
