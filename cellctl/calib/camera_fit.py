@@ -100,7 +100,7 @@ def fit_camera(
     usable, rejected = usable_views(views, minimum_points)
     while True:
         require_views(usable, rejected, NEED)
-        camera, poses = _start(usable, image_size)
+        camera, poses = start_camera(usable, image_size)
         bad = {view.id: NO_POSE for view in usable if view.id not in poses}
         if not bad:
             fit = _fit(usable, camera, np.stack([poses[view.id] for view in usable]), option)
@@ -147,7 +147,7 @@ def _fit(
     return CameraFit(tuple(view.id for view in views), chain, solution)
 
 
-def _start(
+def start_camera(
     views: Sequence[View], image_size: tuple[int, int]
 ) -> tuple[CameraModel, dict[str, Array]]:
     """A pinhole, and T_camera_board by the ids of the views that it explains.

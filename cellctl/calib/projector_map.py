@@ -100,13 +100,12 @@ class ProjectorMap:
     def from_dict(cls, value: Any, where: str = "projector") -> ProjectorMap:
         """Read `to_dict`'s form. BadInput says `where` and what is wrong."""
         try:
-            bend = value["bend"] if "bend" in value else None
             return cls(
                 value["H"],
                 value["centre_px"],
                 value["focal_px"],
                 value["radial"],
-                None if bend is None else Refinement.from_dict(bend, "bend"),
+                Refinement.from_dict(value["bend"], "bend") if "bend" in value else None,
             )
         except (KeyError, TypeError) as error:
             raise BadInput(

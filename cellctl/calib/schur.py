@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from cellctl.errors import SolveError
 from cellctl.geometry import Array
@@ -202,13 +203,14 @@ def _normal(problem: Problem[State], state: State, huber: float) -> Normal:
 
 def _add(normal: Normal, part: Linearised) -> None:
     r, G, L = part.rows
-    Gt, columns, views = np.swapaxes(G, 1, 2), part.columns, part.views
+    columns, views = part.columns, part.views
+    tall = G.reshape(-1, G.shape[-1])  # one product of matrices, not one a view
     square = (columns, columns) if isinstance(columns, slice) else np.ix_(columns, columns)
-    normal.A[square] += (Gt @ G).sum(axis=0)
-    normal.a[columns] += (Gt @ r).sum(axis=0)[:, 0]
+    normal.A[square] += tall.T @ tall
+    normal.a[columns] += tall.T @ r.reshape(-1)
     if L.shape[-1]:
         Lt = np.swapaxes(L, 1, 2)
-        normal.B[views, columns] += Gt @ L
+        normal.B[views, columns] += np.swapaxes(G, 1, 2) @ L
         normal.C[views] += Lt @ L
         normal.b[views] += (Lt @ r)[..., 0]
 
@@ -221,8 +223,8 @@ def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
     C[:, diagonal, diagonal] *= 1.0 + damping
     inverse_C, Bt = inverse_of(C), np.swapaxes(normal.B, 1, 2)
     reduce = normal.B @ inverse_C
-    S = A - (reduce @ Bt).sum(axis=0)
-    by_globals = inverse_of(S) @ ((reduce @ normal.b[..., None]).sum(axis=0)[:, 0] - normal.a)
+    S = A - _summed(reduce, normal.B)
+    by_globals = _solved(S, (reduce @ normal.b[..., None]).sum(axis=0)[:, 0] - normal.a)
     by_locals = -(inverse_C @ (normal.b + Bt @ by_globals)[..., None])[..., 0]
     return by_globals, by_locals
 
@@ -230,10 +232,27 @@ def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
 def _covariance(normal: Normal) -> tuple[Array, Array]:
     inverse_C = inverse_of(normal.C)
     reduce = normal.B @ inverse_C
-    S = normal.A - (reduce @ np.swapaxes(normal.B, 1, 2)).sum(axis=0)
+    S = normal.A - _summed(reduce, normal.B)
     globals_covariance = inverse_of(S)
     locals_covariance = inverse_C + np.swapaxes(reduce, 1, 2) @ globals_covariance @ reduce
     return globals_covariance, locals_covariance
+
+
+def _summed(one: Array, other: Array) -> Array:
+    """sum_i one_i other_i^T (g, g) of (n, g, l), as one product of matrices."""
+    g = one.shape[1]
+    flat = [np.moveaxis(part, 1, 0).reshape(g, -1) for part in (one, other)]
+    return np.asarray(flat[0] @ flat[1].T)
+
+
+def _solved(S: Array, right: Array) -> Array:
+    """S^-1 right (g,), whether or not everything is observed."""
+    size = np.sqrt(np.maximum(S.diagonal(), 1e-300))
+    try:
+        factor = cho_factor(S / np.outer(size, size), check_finite=False)
+    except LinAlgError:
+        return np.asarray(inverse_of(S) @ right)
+    return np.asarray(cho_solve(factor, right / size, check_finite=False) / size)
 
 
 def inverse_of(matrices: Array) -> Array:

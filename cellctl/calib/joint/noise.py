@@ -12,14 +12,14 @@ trace of its part of the hat matrix.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from cellctl.calib.joint.problem import JointProblem
 from cellctl.calib.joint.state import JointState
-from cellctl.calib.schur import Linearised, Normal, Solution, inverse_of
+from cellctl.calib.schur import Linearised, Solution, inverse_of
 from cellctl.geometry import Array
 
 
@@ -42,45 +42,53 @@ OPINIONS = {
     "bend": Opinion(0.05, 4.0),
 }
 VIEWS = Opinion(0.1, 1.0)
+SMOOTH = ("field", "bend", "robot", "look", "level")
+"""Unknowns that stand for what no model says: their priors are groups of their own."""
 LEAST = 1e-3
 """Of its opinion: no noise is thought to be less, so that perfect data remain solvable."""
 
 
 @dataclass(frozen=True, eq=False)
-class Information:
-    """Of one group, in units of its noise: the `reduced` information (u, g, g) on the globals of
-    each of its units (views, circles, ...); `squares` and number of its `rows`; and `explained`,
+class Component:
+    """Of one group, in units of its noise: `squares` and number of its `rows`, and `explained`,
     the trace of its part of the hat matrix."""
 
-    reduced: Array
     squares: float
     rows: int
     explained: float
 
     @property
-    def total(self) -> Array:
-        """(g, g)."""
-        return self.reduced.sum(axis=0)
-
-    @property
     def redundancy(self) -> float:
         return max(self.rows - self.explained, 0.0)
 
-
-def information(solution: Solution[JointState]) -> dict[str, Information]:
-    """By group: those of JointProblem.sigma, and "prior" for what is fixed beforehand."""
-    problem, state = solution.problem, solution.state
-    assert isinstance(problem, JointProblem)
-    back = _Back.of(solution.normal, solution.globals_covariance)
-    found: dict[str, Information] = {}
-    for name, part in problem.parts(state).items():
-        group = "lit" if name.startswith("lit ") else name
-        one = back.information(part.weighted(solution.huber))
-        found[group] = _merged(found[group], one) if group in found else one
-    return found | _of_priors(problem, state, back)
+    def __add__(self, other: Component) -> Component:
+        return Component(
+            self.squares + other.squares,
+            self.rows + other.rows,
+            self.explained + other.explained,
+        )
 
 
-def sigmas(problem: JointProblem, found: Mapping[str, Information]) -> dict[str, float]:
+def components(solution: Solution[JointState]) -> dict[str, Component]:
+    """By group: those of JointProblem.sigma, and what is fixed beforehand."""
+    back, found = _Back.of(solution), dict[str, Component]()
+    for name, part in _parts(solution):
+        one = back.component(part)
+        found[name] = found[name] + one if name in found else one
+    return found
+
+
+def information(solution: Solution[JointState]) -> dict[str, Array]:
+    """By group, as `components`: the reduced information (u, g, g) on the globals of each of its
+    units, which are views, circles, touches, lit points; together they make S."""
+    back, found = _Back.of(solution), dict[str, Array]()
+    for name, part in _parts(solution):
+        one = back.reduced(part)
+        found[name] = np.concatenate([found[name], one]) if name in found else one
+    return found
+
+
+def sigmas(problem: JointProblem, found: Mapping[str, Component]) -> dict[str, float]:
     """The noises that the residuals ask for, given those that were assumed."""
     new = {}
     for name, sigma in problem.sigma.items():
@@ -96,76 +104,60 @@ def sigmas(problem: JointProblem, found: Mapping[str, Information]) -> dict[str,
     return new
 
 
+def _parts(solution: Solution[JointState]) -> Iterator[tuple[str, Linearised]]:
+    """All rows by the name of their group, weighted; priors too, as if they were seen."""
+    problem, state = solution.problem, solution.state
+    assert isinstance(problem, JointProblem)
+    for name, part in problem.parts(state).items():
+        yield "lit" if name.startswith("lit ") else name, part.weighted(solution.huber)
+    local_off, local_slopes = problem.local_priors(state)
+    for name, rows in (("turn", slice(0, 3)), ("shift", slice(3, 6))):
+        slopes = local_slopes[:, rows, None]
+        off = local_off[:, rows, None]
+        none = np.zeros((*slopes.shape[:3], 0))
+        yield name, Linearised(off, none, slopes, np.zeros(0, dtype=int))
+    for name, (off, slopes) in problem.global_priors(state).items():
+        columns, group = problem.layout.columns([name]), name if name in SMOOTH else "prior"
+        none = np.zeros((1, len(off), 1, 0))
+        yield group, Linearised(off[None, :, None], slopes[None, :, None], none, columns)
+
+
 @dataclass(frozen=True, eq=False)
 class _Back:
-    """What reduces rows: C^-1 (n, l, l) and B C^-1 (n, g, l), and the globals' covariance."""
+    """What reduces rows: C^-1 (n, l, l), B C^-1 (n, g, l), and the covariance of the globals, of
+    the globals with the locals (n, g, l), and of the locals (n, l, l)."""
 
     inverse_C: Array
     reduce: Array
     covariance: Array
 
     @classmethod
-    def of(cls, normal: Normal, covariance: Array) -> _Back:
-        inverse_C = inverse_of(normal.C)
-        return cls(inverse_C, normal.B @ inverse_C, covariance)
+    def of(cls, solution: Solution[JointState]) -> _Back:
+        inverse_C = inverse_of(solution.normal.C)
+        return cls(inverse_C, solution.normal.B @ inverse_C, solution.globals_covariance)
 
-    def information(self, part: Linearised) -> Information:
+    def component(self, part: Linearised) -> Component:
+        """Without reducing a row: the trace of A^T A times the covariance of all unknowns that
+        the rows A touch."""
         r, G, L = part.rows
-        count = len(self.covariance)
-        wide = np.zeros((len(r), r.shape[1], count))
+        columns = part.columns
+        mine = self.covariance[columns][:, columns]
+        explained = float(((np.swapaxes(G, 1, 2) @ G).sum(axis=0) * mine).sum())
+        if L.shape[-1]:
+            reduce, Lt = self.reduce[part.views], np.swapaxes(L, 1, 2)
+            across = self.covariance[columns] @ reduce
+            explained -= 2.0 * float(((np.swapaxes(G, 1, 2) @ L) * across).sum())
+            own = self.inverse_C[part.views] + np.swapaxes(reduce, 1, 2) @ self.covariance @ reduce
+            explained += float(((Lt @ L) * own).sum())
+        known = int(np.count_nonzero(G.any(axis=2) | L.any(axis=2)))
+        return Component(float(np.square(r).sum()), known, explained)
+
+    def reduced(self, part: Linearised) -> Array:
+        _, G, L = part.rows
+        wide = np.zeros((*G.shape[:2], len(self.covariance)))
         wide[..., part.columns] = G
-        local = 0.0
         if L.shape[-1]:
             wide -= L @ np.swapaxes(self.reduce[part.views], 1, 2)
-            local = float(np.einsum("nki,nij,nkj->", L, self.inverse_C[part.views], L))
         else:  # each residual is a unit of its own
-            wide = wide.reshape(-1, part.residuals.shape[-1], count)
-        return self._of_rows(wide, np.square(r), local)
-
-    def of_local_prior(self, slopes: Array, off: Array, rows: slice) -> Information:
-        """Of `rows` of whitened residuals (n, 6) with derivatives (n, 6, 6) by the locals; zero
-        for views of which nothing is known."""
-        part, squares = slopes[:, rows], np.square(off[:, rows])
-        wide = -part @ np.swapaxes(self.reduce, 1, 2)
-        local = float(np.einsum("nki,nij,nkj->", part, self.inverse_C, part))
-        found = self._of_rows(wide, squares, local)
-        return replace(found, rows=3 * int(part.any(axis=(1, 2)).sum()))
-
-    def of_global_prior(self, off: Array, jacobian: Array) -> Information:
-        return self._of_rows(jacobian[None], np.square(off), 0.0)
-
-    def _of_rows(self, wide: Array, squares: Array, local: float) -> Information:
-        reduced = np.swapaxes(wide, 1, 2) @ wide
-        explained = float((reduced.sum(axis=0) * self.covariance).sum()) + local
-        return Information(reduced, float(squares.sum()), squares.size, explained)
-
-
-def _merged(one: Information, other: Information) -> Information:
-    return Information(
-        np.concatenate([one.reduced, other.reduced]),
-        one.squares + other.squares,
-        one.rows + other.rows,
-        one.explained + other.explained,
-    )
-
-
-def _of_priors(problem: JointProblem, state: JointState, back: _Back) -> dict[str, Information]:
-    found, count = {}, problem.layout.count
-    priors = problem.priors(state)
-    if priors.on_locals.size:
-        turn, shift = (
-            back.of_local_prior(priors.locals_jacobian, priors.on_locals, rows)
-            for rows in (slice(0, 3), slice(3, 6))
-        )
-        found["turn"], found["shift"] = turn, shift
-    rest = [(np.zeros(0), np.zeros((0, count)))]
-    for name, (off, slopes) in problem.global_priors(state).items():
-        jacobian = np.zeros((len(off), count))
-        jacobian[:, problem.layout.slices[name]] = slopes
-        if name in ("field", "bend", "robot", "look"):
-            found[name] = back.of_global_prior(off, jacobian)
-        else:
-            rest.append((off, jacobian))
-    off, jacobian = (np.concatenate(parts) for parts in zip(*rest, strict=True))
-    found["prior"] = back.of_global_prior(off, jacobian)
-    return found
+            wide = wide.reshape(-1, part.residuals.shape[-1], wide.shape[-1])
+        return np.swapaxes(wide, 1, 2) @ wide

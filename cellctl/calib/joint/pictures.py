@@ -39,7 +39,7 @@ def world_camera(state: JointState, look: Array) -> Array:
 def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Array) -> Picture:
     """Of the pen, commanded to xy (n, 2) m with its tool turned by `turn` (n, 2, 2), R(yaw).
     "place" stands for xy itself."""
-    place = xy + turn @ state.tcp[:2]
+    place = xy + turn @ state.tcp
     T = world_camera(state, look)
     in_camera = transform_points(invert(T), state.table.points(place))
     plain, by_camera = _normalised(in_camera)
@@ -52,7 +52,7 @@ def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Ar
     in_plane = g[..., :2] + g[..., 2:] * state.table.slopes(place)[:, None]
     slopes = _of_camera_pose(state, by_plain @ by_camera, in_camera)
     slopes["table"] = g[..., 2:] * state.table.basis(place)[:, None]
-    slopes["tcp"] = np.concatenate([in_plane @ turn, np.zeros((len(xy), 2, 1))], axis=-1)
+    slopes["tcp"] = in_plane @ turn
     slopes["place"] = in_plane
     if field is not None:
         slopes["field"] = field.slopes(plain)

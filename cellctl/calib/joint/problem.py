@@ -20,8 +20,7 @@ from cellctl.geometry import Array, invert
 CENTRE_SIGMA_PX, RADIAL_SIGMA, FOCAL_SIGMA = 15.0, 0.1, 0.1
 """Of a projector, before anything was seen: its centre about the data sheet's, k1 and k2, and,
 where it is free, the focal length's logarithm."""
-TCP_HEIGHT_MM = 1.0
-"""Of the pen's length."""
+PEN_LENGTH_SIGMA_M = 1e-3
 ROBOT_COMMON = 2.0
 """A robot's error is smooth: what all views share is as large as what scatters between them, and
 more. In standard deviations of the latter."""
@@ -78,6 +77,7 @@ class JointProblem:
     mm: Array
     look: Array
     field: Field | None
+    bend: Field | None
     lens: LensPrior | None
     table_start: Array
     sigma: Mapping[str, float]
@@ -121,7 +121,7 @@ class JointProblem:
         if len(self.touches):
             found["touch"] = self._touches(state)
         if len(self.markers):
-            picture = light_on_table(state, self.look, self.field, self.markers.projector_px)
+            picture = light_on_table(state, self.look, self.bend, self.markers.projector_px)
             found["markers"] = self._pictured(
                 state, picture, self.markers.camera_px, np.eye(2) / self.sigma["markers"]
             )
@@ -155,13 +155,12 @@ class JointProblem:
 
     def _touches(self, state: JointState) -> Linearised:
         xy, z = self.touches[:, :2], self.touches[:, 2]
-        off = (state.table.height(xy) - state.tcp[2] - z) / self.sigma["touch"]
-        slopes, names = state.table.basis(xy), ["table"]
-        if "tcp" in self.layout:
-            slopes = np.column_stack([slopes, np.zeros((len(z), 2)), -np.ones(len(z))])
-            names.append("tcp")
-        slopes = slopes[None, :, None] / self.sigma["touch"]
-        columns = self.layout.columns(names)
+        basis = state.table.basis(xy)
+        off = (basis @ state.table.coefficients - basis[:, :3] @ state.level - z) / self.sigma[
+            "touch"
+        ]
+        slopes = np.column_stack([basis, -basis[:, :3]])[None, :, None] / self.sigma["touch"]
+        columns = self.layout.columns(["table", "level"])
         return Linearised(off[None, :, None], slopes, slopes[..., :0], columns, slice(0, 0))
 
     def _lit(self, state: JointState, one: LitBoard, group: ViewGroup, view: int) -> Linearised:
@@ -207,13 +206,18 @@ class JointProblem:
             jacobian[:, self.layout.slices[name]] = slopes
             rows.append(off)
             jacobians.append(jacobian)
+        return Priors(np.concatenate(rows), np.concatenate(jacobians), *self.local_priors(state))
+
+    def local_priors(self, state: JointState) -> tuple[Array, Array]:
+        """Whitened residuals (n, 6) of the views' corrections, and derivatives (n, 6, 6); zero
+        where the robot says nothing."""
         vectors = pose_vectors(state.corrections) / self.robot_sigma
         slopes = pose_vector_derivatives(state.corrections) / self.robot_sigma[:, None]
         for group in self.groups:
             if group.free_pose:
                 vectors[group.views] = 0.0
                 slopes[group.views] = 0.0
-        return Priors(np.concatenate(rows), np.concatenate(jacobians), vectors, slopes)
+        return vectors, slopes
 
     def global_priors(self, state: JointState) -> dict[str, tuple[Array, Array]]:
         """Whitened residuals (r,) and derivatives (r, c) of what is known beforehand, by the
@@ -224,7 +228,10 @@ class JointProblem:
             if name in self.layout:
                 found[name] = (off / sigma, np.diag(1.0 / np.broadcast_to(sigma, off.shape)))
 
-        add("tcp", state.tcp, 1e-3 * np.array([TCP_PRIOR_MM, TCP_PRIOR_MM, TCP_HEIGHT_MM]))
+        add("tcp", state.tcp, np.full(2, 1e-3 * TCP_PRIOR_MM))
+        half = (state.table.area.high - state.table.area.low) / 2
+        edges = ROBOT_COMMON * self.sigma["turn"] * half
+        add("level", state.level, np.append(PEN_LENGTH_SIGMA_M, edges))
         off = state.table.coefficients - self.table_start
         add("table", off, np.array(TABLE_SIGMA_M[: len(off)]))
         common = ROBOT_COMMON * self.robot_sigma
@@ -233,8 +240,8 @@ class JointProblem:
                 found[name] = PosePrior(np.eye(4), common).whitened(off_pose)
         for name, board in state.boards.items():
             add(f"{name} scale", np.array([board.log_scale]), np.array([SCALE_SIGMA]))
-            half = max(float(g.chain.sheet.half.max()) for g in self.groups if g.board == name)
-            add(f"{name} warp", board.warp, np.full(3, WARP_SIGMA * half))
+            size = max(float(g.chain.sheet.half.max()) for g in self.groups if g.board == name)
+            add(f"{name} warp", board.warp, np.full(3, WARP_SIGMA * size))
         for name, values in (("field", state.field), ("bend", state.bend)):
             add(name, values.reshape(-1), np.full(values.size, self.sigma[name]))
         if "projector" in self.layout and self.lens is not None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.homography import apply_homography
-from cellctl.calib.joint.noise import Information
+from cellctl.calib.joint.noise import Component, components, information
 from cellctl.calib.joint.observations import Observations
 from cellctl.calib.joint.pictures import light_on_table, pen, world_camera
 from cellctl.calib.joint.problem import JointProblem
@@ -25,12 +25,21 @@ GRID = 11
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """`information` by group of observations, see `noise.information`."""
+    """What was seen, where the adjustment began, and where it ended."""
 
     seen: Observations
     start: Calibration
     solution: Solution[JointState]
-    information: Mapping[str, Information]
+
+    @cached_property
+    def components(self) -> Mapping[str, Component]:
+        """Squares and redundancy of each group of observations."""
+        return components(self.solution)
+
+    @cached_property
+    def information(self) -> Mapping[str, Array]:
+        """What each unit of each group tells about the globals, see `noise.information`."""
+        return information(self.solution)
 
     @property
     def problem(self) -> JointProblem:
@@ -48,7 +57,7 @@ class JointResult:
     @property
     def sigma(self) -> Mapping[str, float]:
         """Noise of each group of observations, units as in JointProblem."""
-        return {n: s for n, s in self.problem.sigma.items() if n in self.information}
+        return {n: s for n, s in self.problem.sigma.items() if n in self.components}
 
     @cached_property
     def covariance(self) -> Array:
@@ -91,7 +100,7 @@ class JointResult:
             return None
         field, table = self.problem.field, plain.table_homography
         shift = np.eye(3)
-        shift[:2, 2] = self.state.tcp[:2]
+        shift[:2, 2] = self.state.tcp
         H = table @ shift @ np.linalg.inv(table)
         if field is None:
             return Refinement("joint", H=H / H[2, 2])
@@ -110,7 +119,7 @@ class JointResult:
 
     def _bend(self, plain: ProjectorMap) -> Refinement | None:
         """From where `plain` has a pixel's light to where it is seen."""
-        field = self.problem.field
+        field = self.problem.bend
         if field is None or not self.state.bend.size:
             return None
         found = field.refinement(self.state.bend)
@@ -118,7 +127,7 @@ class JointResult:
             return found
         world = self.state.table.points(self.places)
         pixels = self.state.projector.project(world)
-        exact = light_on_table(self.state, self.problem.look, field, pixels).xy
+        exact = light_on_table(self.state, self.problem.look, self.problem.bend, pixels).xy
         at = plain.locate(pixels)
         return replace(found, weights=found.weights + _weights(found, at, exact - found.apply(at)))
 

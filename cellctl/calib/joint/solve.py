@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cellctl.calib.calibration import Calibration
-from cellctl.calib.joint.noise import information, sigmas
+from cellctl.calib.joint.noise import components, sigmas
 from cellctl.calib.joint.observations import Observations
 from cellctl.calib.joint.problem import JointProblem
 from cellctl.calib.joint.result import JointResult
@@ -15,7 +15,7 @@ from cellctl.calib.schur import Solution, minimise
 from cellctl.calib.table_surface import Area
 
 HUBER = 4.0
-ROUNDS, SETTLED = 8, 0.02
+ROUNDS, SETTLED = 6, 0.03
 """Noises are estimated so often at most, or until none changes by more than that part."""
 ALL = JointOptions()
 
@@ -35,17 +35,17 @@ def solve_joint(
     """
     problem, state = begin(seen, start, options, area)
     solution = _settled(problem, state)
-    return JointResult(seen, start, solution, information(solution))
+    return JointResult(seen, start, solution)
 
 
 def _settled(problem: JointProblem, state: JointState) -> Solution[JointState]:
     """Adjusted with noises that its own residuals ask for."""
-    solution = minimise(problem, state, huber=HUBER, tolerance=1e-4)
+    solution = minimise(problem, state, huber=HUBER, tolerance=1e-3)
     for _ in range(ROUNDS):
-        new = sigmas(problem, information(solution))
+        new = sigmas(problem, components(solution))
         change = max(abs(np.log(new[name] / problem.sigma[name])) for name in new)
         problem = problem.with_sigma(new)
-        solution = minimise(problem, solution.state, huber=HUBER, tolerance=1e-6)
+        solution = minimise(problem, solution.state, huber=HUBER, tolerance=1e-5)
         if change < SETTLED:
             break
     return solution

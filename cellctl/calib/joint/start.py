@@ -26,8 +26,8 @@ from cellctl.calib.views import Batch, RobotView
 from cellctl.errors import BadInput, SolveError
 from cellctl.geometry import Array, invert, transform_points
 
-FIELD_LENGTH = 1.5
-"""Of the smooth displacements, in half the drawn area's longer side."""
+FIELD_LENGTH, BEND_LENGTH = 0.8, 1.5
+"""Of the smooth displacements of what is drawn and lit, in half the drawn area's longer side."""
 FIELD_NODES, FIELD_REACH = 7, 1.3
 NEGLIGIBLE_MODE = 1e-4
 """Modes whose variance is below that part of the largest are left out."""
@@ -39,13 +39,13 @@ GRID = 11
 @dataclass(frozen=True)
 class JointOptions:
     """What the adjustment may change. `table`: the kind of surface (table_surface.TERMS);
-    `field`: smooth displacements of drawn circles, of `field_length` half sides of the area."""
+    `smooth`: displacements of what is drawn, of `field_length` half sides of the area, and lit."""
 
     camera: bool = True
     scale: bool = True
     warp: bool = True
     table: str = "plane"
-    field: bool = True
+    smooth: bool = True
     field_length: float = FIELD_LENGTH
 
 
@@ -95,7 +95,8 @@ def begin(
         boards={n: BoardState(one.board_pose, 0.0, np.zeros(3)) for n, one in boards.items()},
         table=Table.of_plane(start.table, area or _area(seen, start), options.table),
         projector=replace(start.projector, bend=None),
-        tcp=np.zeros(3),
+        tcp=np.zeros(2),
+        level=np.zeros(3),
         field=np.zeros((0, 2)),
         bend=np.zeros((0, 2)),
         corrections=np.concatenate([np.zeros((0, 4, 4)), *(one.corrections for one in located)]),
@@ -116,11 +117,13 @@ def _problem(
     lens: LensPrior | None,
     options: JointOptions,
 ) -> tuple[JointProblem, JointState]:
-    field = None
-    if options.field:
+    field = bend = None
+    if options.smooth and len(seen.circles):
         field = _field(state, look, options.field_length)
-        nothing = np.zeros((field.count, 2))
-        state = replace(state, field=nothing, bend=nothing)
+        state = replace(state, field=np.zeros((field.count, 2)))
+    if options.smooth and len(seen.markers):
+        bend = _field(state, look, BEND_LENGTH)
+        state = replace(state, bend=np.zeros((bend.count, 2)))
     layout = _layout(seen, state, located, options, lens)
     groups = _groups(layout, located, options)
     problem = JointProblem(
@@ -133,6 +136,7 @@ def _problem(
         mm=_mm(state, look, seen),
         look=look,
         field=field,
+        bend=bend,
         lens=lens,
         table_start=state.table.coefficients,
         sigma={group.name: VIEWS.sigma for group in groups}
@@ -148,14 +152,16 @@ def _located(
     every = [v for g in seen.views if g.board == group.board for v in g.views]
     sheet = Sheet.of(np.concatenate([view.points for view in every]))
     before, after = _robot(group, seen.mount)
-    possible = [[pose.matrix for pose in board_poses(view, camera)] for view in group.views]
+    possible = [
+        [pose.matrix for pose in board_poses(view, camera, refine=False)] for view in group.views
+    ]
     if not group.through_robot:
         best = np.stack([poses[0] for poses in possible])
         return Located(group, best, np.eye(4), before, after, sheet)
     chain = zip(before, after, possible, strict=True)
     on_mount = [[invert(b @ f) @ camera_pose @ T for T in poses] for b, f, poses in chain]
     board_pose = _middle_pose(on_mount)
-    nearest = [int(np.argmin([_apart(board_pose, T) for T in poses])) for poses in on_mount]
+    nearest = [int(np.argmin(_apart(board_pose, np.stack(poses)))) for poses in on_mount]
     in_camera = np.stack([poses[i] for poses, i in zip(possible, nearest, strict=True)])
     return Located(group, in_camera, board_pose, before, after, sheet)
 
@@ -171,15 +177,16 @@ def _robot(group: BoardViews, mount: Mount) -> tuple[Array, Array]:
 
 def _middle_pose(options: Sequence[Sequence[Array]]) -> Array:
     """The one of all poses that is nearest to the nearest of each view's."""
-    every = [pose for poses in options for pose in poses]
-    total = [sum(min(_apart(one, other) for other in poses) for poses in options) for one in every]
+    every = np.concatenate([np.stack(poses) for poses in options])
+    total = sum(_apart(every[:, None], np.stack(poses)).min(axis=1) for poses in options)
     return np.asarray(every[int(np.argmin(total))])
 
 
-def _apart(one: Array, other: Array) -> float:
-    """Metres, a radian counting as one: the distance of poses, both of a size that boards have."""
-    turned = np.linalg.norm(one[:3, :3] - other[:3, :3]) / np.sqrt(2.0)
-    return float(np.linalg.norm(one[:3, 3] - other[:3, 3]) + turned)
+def _apart(one: Array, other: Array) -> Array:
+    """Metres, a radian counting as one: the distance (...) of poses (..., 4, 4)."""
+    off = one - other
+    turned = np.sqrt(np.square(off[..., :3, :3]).sum(axis=(-2, -1)) / 2.0)
+    return np.asarray(np.linalg.norm(off[..., :3, 3], axis=-1) + turned)
 
 
 def _lens_prior(projector: ProjectorMap) -> LensPrior | None:
@@ -218,12 +225,13 @@ def _layout(
         sizes[f"{board} scale"] = 1 * (options.scale and board in tied)
         sizes[f"{board} warp"] = 3 * options.warp
     sizes["table"] = TERMS[options.table] * (on_table or bool(len(seen.touches)))
+    sizes["level"] = 3 * bool(len(seen.touches))
     if len(seen.markers) or seen.lit_boards:
         full = isinstance(state.projector, FullProjector)
         sizes["projector"] = 11 if full else 8 if lens is None else 12
-        sizes["bend"] = state.bend.size if len(seen.markers) else 0
+        sizes["bend"] = state.bend.size
     if len(seen.circles):
-        sizes |= {"tcp": 3, "field": state.field.size}
+        sizes |= {"tcp": 2, "field": state.field.size}
         sizes["robot"] = 6 * (bool(tied) and seen.mount == "eye-to-hand")
     sizes["look"] = 6 * (seen.look is not None and on_table)
     return Layout({name: size for name, size in sizes.items() if size})

@@ -103,10 +103,10 @@ class FullProjector:
 @dataclass(frozen=True, eq=False)
 class Field:
     """Smooth displacements in the camera's plane that no parameter explains: what the arm's
-    kinematic errors do to drawn circles, and the table's bow to light. A Gaussian process with the kernel
-    exp(-r^2 / 2 length^2), r in units of `scale` about `centre`, written as `modes` (k, m)
-    of the radial functions about `nodes` (k, 2): Rasmussen, Williams, Gaussian Processes for
-    Machine Learning, 2006, section 8.1. `mm`: millimetres on the table of one `scale`."""
+    kinematic errors do to drawn circles, and the table's bow to light. A Gaussian process with
+    the kernel exp(-r^2 / 2 length^2), r in units of `scale` about `centre`, written as `modes`
+    (k, m) of the radial functions about `nodes` (k, 2): Rasmussen, Williams, Gaussian Processes
+    for Machine Learning, 2006, section 8.1. `mm`: millimetres on the table of one `scale`."""
 
     centre: Array
     scale: float
@@ -148,7 +148,9 @@ class Field:
 class JointState:
     """`camera_pose` is T_anchor_camera, the anchor being the world or the flange.
 
-    `tcp` (3,) m, how far the pen's tip is from where it is believed, in world axes at yaw 0;
+    `tcp` (2,) m, how far the pen's tip is from where it is believed, in world axes at yaw 0;
+    `level` (3,) m, what is to be added to heights that were felt: in the middle of the table's
+    area, for the pen's length, and at its edges in x and y, for the arm's error;
     `field` and `bend` (m, 2) mm, the smooth displacements of what is drawn and of what is lit;
     `corrections` (n, 4, 4) of all views. `robot_off` (4, 4) is how far the robot is off in all
     views alike, against where it is off at the table: T_world_flange = robot_off @ reported @
@@ -162,6 +164,7 @@ class JointState:
     table: Table
     projector: ProjectorMap | FullProjector
     tcp: Array
+    level: Array
     field: Array
     bend: Array
     corrections: Array
@@ -213,6 +216,7 @@ class Layout:
             ),
             projector=_moved_projector(state.projector, part.get("projector")),
             tcp=state.tcp + part.get("tcp", 0.0),
+            level=state.level + part.get("level", 0.0),
             field=state.field + np.reshape(part.get("field", 0.0), (-1, 2)),
             bend=state.bend + np.reshape(part.get("bend", 0.0), (-1, 2)),
             corrections=state.corrections @ pose_matrices(by_locals)

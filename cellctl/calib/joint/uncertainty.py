@@ -28,6 +28,7 @@ SOURCES = {
     "robot": "arm",
     "look": "arm",
     "bend": "projector",
+    "level": "plane",
     "prior": "prior",
 }
 """What the noise of a group of observations is called in a budget. Views have their own names,
@@ -88,7 +89,7 @@ def map_slopes(result: JointResult, points: Array) -> Array:
     xy = np.asarray(points, dtype=float)[:, :2]
     drawn = pen(state, problem.look, problem.field, xy, np.broadcast_to(np.eye(2), (len(xy), 2, 2)))
     pixels = result.calibration.project(xy)
-    lit = light_on_table(state, problem.look, problem.field, pixels)
+    lit = light_on_table(state, problem.look, problem.bend, pixels)
     J = np.zeros((len(xy), 2, problem.layout.count))
     for sign, picture in ((-1.0, drawn), (1.0, lit)):
         for name, slopes in picture.slopes.items():
@@ -129,14 +130,14 @@ def data(result: JointResult) -> dict[str, Array]:
     globals: (u, g, g). Views go by the name of their group, with the robot's word on them."""
     found = {}
     for group in result.problem.groups:
-        units = result.information[group.name].reduced.copy()
+        units = result.information[group.name].copy()
         for name in ("turn", "shift"):
-            units += result.information[name].reduced[group.views]
+            units += result.information[name][group.views]
         found[group.name] = units
     kinds = {"touch": "touches", "markers": "markers", "lit": "lit boards", "draw": "circles"}
     for name, kind in kinds.items():
         if name in result.information:
-            found[kind] = result.information[name].reduced
+            found[kind] = result.information[name]
     return found
 
 
@@ -145,7 +146,7 @@ def _by_source(result: JointResult) -> dict[str, Array]:
     for name, source in SOURCES.items():
         if name in result.information:
             before = found.get(source, 0.0)
-            found[source] = before + result.information[name].total
+            found[source] = before + result.information[name].sum(axis=0)
     return found
 
 
@@ -161,7 +162,7 @@ def _with_tcp(result: JointResult, J: Array, parts: dict[str, Array]) -> dict[st
 
 def _normal(result: JointResult) -> Array:
     """The Schur complement (g, g): what all data tell about the globals."""
-    return np.asarray(sum(one.total for one in result.information.values()))
+    return np.asarray(sum(one.sum(axis=0) for one in result.information.values()))
 
 
 def _spread(J: Array, covariance: Array) -> Array:
