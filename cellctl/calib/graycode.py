@@ -7,6 +7,7 @@ at integers, so the edge between pixels i and i + 1 is at i + 1/2.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -128,7 +129,7 @@ def code_from(value: Any, size: tuple[int, int], where: str) -> GrayCode:
     None is OpenCV's order. An object has some of KEYS: `order` (of SECTIONS), `column_bits` and
     `row_bits`, `first_bit` "msb" or "lsb", `inverses`, `offset` [x, y]. A text is read for the
     same, as in "column bits MSB first, each followed by its inverse, then row bits, then white,
-    black".
+    black"; "no inverse" where there is none.
     """
     if isinstance(value, str):
         value = _described(value, where)
@@ -154,7 +155,7 @@ def code_from(value: Any, size: tuple[int, int], where: str) -> GrayCode:
 
 def _described(text: str, where: str) -> dict[str, Any]:
     """What a text says of the order of the pictures."""
-    words = text.lower().replace(",", " ").split(":")[-1].split()
+    words = re.findall(r"[a-z]+", text.lower().split(":")[-1])
     places = {
         section: words.index(word)
         for section, word in zip(SECTIONS, ("column", "row", "white", "black"), strict=True)

@@ -22,7 +22,9 @@ TUKEY = 4.0
 AGREE = 0.6
 """Part of the edges about a place that must agree: across the border of two surfaces they do
 not."""
-LEAST_SIGMA = 0.02
+LEAST_SIGMA, MOST_SIGMA = 0.02, 0.4
+"""How far single edges are off: at least, projector px; at most, camera px. Edges of two surfaces
+agree with nothing but a mean of both."""
 
 
 MOST_EDGES = 300
@@ -82,10 +84,11 @@ def _fit(
     down = _equations((rows.places - place) / radius, rows.values - middle[1], 3)
     A, y = (np.concatenate(pair) for pair in zip(across, down, strict=True))
     solution, off, sigma = _robust(A, y)
-    if np.mean(off < TUKEY * sigma) < AGREE:
-        return None
     linear, shift, perspective = solution[[[0, 1], [3, 4]]], solution[[2, 5]], solution[6:]
     slopes = (linear - np.outer(shift, perspective)) / radius
+    scale = np.sqrt(abs(np.linalg.det(slopes)))
+    if np.mean(off < TUKEY * sigma) < AGREE or sigma > max(MOST_SIGMA * scale, LEAST_SIGMA):
+        return None
     return middle + shift, slopes, np.array(sigma)
 
 

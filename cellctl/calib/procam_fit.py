@@ -27,9 +27,9 @@ from cellctl.geometry import Array, transform_points
 
 HUBER = 4.0
 ROUNDS = 4
-ITERATIONS = 300
+ITERATIONS, FEW = 100, 12
 """Two captures leave flat valleys: an adjustment that is stopped early ends far from the bottom,
-most of all that of a projector with lens shift."""
+most of all that of a projector with lens shift. A few tell which start is the best."""
 PINHOLE, LENS = (0, 1, 2, 3), (0, 1, 2, 3, 4, 5, 6, 7)
 """Places in camera.INTRINSICS: without, and with, k1 k2 p1 p2."""
 PINHOLES = ProcamFree(PINHOLE, PINHOLE, pose=True)
@@ -88,11 +88,11 @@ class ProcamFit:
             fit = replace(fit, noise=_noise(fit))
         return fit.settled(fit.noise)
 
-    def settled(self, noise: Noise) -> ProcamFit:
-        """The least cost with noise such as this."""
+    def settled(self, noise: Noise, iterations: int = ITERATIONS) -> ProcamFit:
+        """The least cost with noise such as this, or what so many iterations make of it."""
         problem = self.problem.whitened_at(self.state, noise)
         solution = minimise(
-            problem, self.state, huber=HUBER, max_iterations=ITERATIONS, tolerance=1e-10
+            problem, self.state, huber=HUBER, max_iterations=iterations, tolerance=1e-8
         )
         return ProcamFit(self.captures, problem, noise, solution)
 
@@ -198,12 +198,12 @@ def _from_scratch(
     for start in starts(captures, image_size, size):
         if np.isfinite(problem.residuals(start)).all():
             begin = Solution(problem, start, HUBER, np.inf, 0, converged=False)
-            fits.append(ProcamFit(captures, problem, noise, begin).settled(noise))
+            fits.append(ProcamFit(captures, problem, noise, begin).settled(noise, FEW))
     if not fits:
         raise SolveError("no camera and projector in front of the board explain the captures")
     best = min(fits, key=lambda fit: fit.solution.cost)
     full = replace(best, problem=replace(best.problem, free=OPTIONS[0]))
-    return full.settled(noise).settled(noise)
+    return full.settled(noise, 3 * FEW)
 
 
 def plausible(size: tuple[int, int], centre: float | None) -> Plausible:

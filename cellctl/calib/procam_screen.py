@@ -28,8 +28,6 @@ SURFACE = 0.15
 """Part of the points that on a plane of their own make a second surface."""
 SAMPLES = 300
 
-Orientation = str
-
 
 def screened(
     captures: Sequence[Capture], seen: dict[str, int]
@@ -98,21 +96,25 @@ def _on_one_plane(capture: Capture, seen: int) -> tuple[Capture | None, str]:
     if on_a_line(capture.points):
         return None, "all points read lie on one line of the board"
     on_plane = _consensus(capture)
-    rest = capture[~on_plane]
-    if on_plane.sum() >= least:
-        return capture[on_plane], ""
-    second = 0
-    if len(rest.points) >= MINIMUM_POINTS and not on_a_line(rest.points):
-        second = int(_consensus(rest).sum())
+    second = _second(capture[~on_plane])
     if on_plane.sum() >= MINIMUM_POINTS and second >= max(MINIMUM_POINTS, SURFACE * read):
         return None, (
             f"several surfaces: {on_plane.sum()} of the board's points were lit on one plane, "
             f"{second} on another; keep everything else out of the beam"
         )
+    if on_plane.sum() >= least:
+        return capture[on_plane], ""
     return None, (
         f"too few inliers: only {on_plane.sum()} of {read} points agree with a flat board: were "
         "its pictures mixed up with another capture's, or did it move in between?"
     )
+
+
+def _second(rest: Capture) -> int:
+    """How many of the points that are not on the main plane share one of their own."""
+    if len(rest.points) < MINIMUM_POINTS or on_a_line(rest.points):
+        return 0
+    return int(_consensus(rest).sum())
 
 
 def _consensus(capture: Capture) -> Mask:
