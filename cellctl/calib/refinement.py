@@ -18,6 +18,7 @@ FAMILIES = (
     "joint",
     "affine",
     "projective",
+    "challenger",
     "quadratic",
     "rbf",
     "thin-plate",
