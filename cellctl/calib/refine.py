@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,8 @@ from cellctl.calib.adjust import joint_family
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.challenger import NAME as CHALLENGER
 from cellctl.calib.challenger import challenger_family
+from cellctl.calib.joint.held_out import JointFit, joint_candidate
+from cellctl.calib.joint.result import JointResult
 from cellctl.calib.refine_fit import (
     FAMILIES,
     LARGEST_CONDITION,
@@ -23,7 +25,7 @@ from cellctl.calib.refine_fit import (
     fit,
     held_out_fits,
 )
-from cellctl.calib.refine_result import Candidate, RefineResult
+from cellctl.calib.refine_result import JOINT, Candidate, RefineResult
 from cellctl.calib.views import Rejection, excess
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
@@ -38,6 +40,14 @@ UNDETERMINED = 1e3
 HUBER_MM = 0.4
 OUTLIER_SIGMAS, OUTLIER_FLOOR_MM = 5.0, 0.6
 LARGEST_REJECTED = 0.4
+RIVALS = {
+    JOINT: "by the joint adjustment of everything that was seen",
+    CHALLENGER: "by the circles alone, without hand-eye",
+}
+"""Of the corrections of hand-eye's chain, the first being preferred; in words."""
+
+Adjust = Callable[[Sequence[Mark]], JointResult]
+"""The joint adjustment of a run, with these of its circles. SolveError when there is none."""
 
 
 def solve_refine(
@@ -46,6 +56,7 @@ def solve_refine(
     *,
     pose_covariance: Array | None = None,
     families: Sequence[str] | None = None,
+    adjust: Adjust | None = None,
 ) -> RefineResult:
     """The correction of `base` (whose own refinement is ignored) that predicts unseen circles
     best, and the pen's offset.
@@ -53,9 +64,9 @@ def solve_refine(
     Each family is judged by the worse of two held-out errors, everything being fitted again:
     without one circle, and without one row or column of them; see `choose`. Circles that
     contradict the others are left out of every fit and still get a held-out error.
-    `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult, allows the joint
-    adjustment. `families`: only these are tried. SolveError when fewer than 4 circles agree;
-    BadInput as `Marks.of`.
+    `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult, allows to move pose
+    and table. `families`: only these are tried. `adjust` makes the joint adjustment a candidate.
+    SolveError when fewer than 4 circles agree; BadInput as `Marks.of`.
     """
     base = replace(base, refinement=None)
     marks = sorted(marks, key=lambda mark: mark.key)
@@ -67,6 +78,8 @@ def solve_refine(
     known = _families(drawn, used, frame, base, pose_covariance)
     wanted = [f for f in known if families is None or f.name in families]
     tried = [_candidate(family, drawn, used, frame, base) for family in wanted]
+    if adjust is not None:
+        tried.append(_adjusted(adjust, marks, drawn, used, base))
     chosen, why = choose([c for c in tried if c.fit is not None])
     assert chosen.fit is not None
     errors = chosen.fit.errors_mm(drawn)
@@ -90,6 +103,7 @@ def solve_refine(
         ),
         mark_sigma_mm=_sigma(chosen.fit, errors[used]),
         mark_freedom=chosen.fit.freedom,
+        joint=next((c.fit.result for c in tried if isinstance(c.fit, JointFit)), None),
     )
 
 
@@ -109,26 +123,31 @@ def _families(
 def choose(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
     """The candidate to trust and why, in words.
 
-    The others come from the simplest on, and the first that the data cannot tell from the best one
-    stands for them, see `views.excess`. The challenger is taken unless that one predicts circles
-    left out one by one better, by more than chance does: it takes nothing on trust but the
-    circles, and since its field is no larger than they ask for, it needs no row of them left out to
-    keep it from bending between rows.
+    Corrections of hand-eye's chain come from the simplest on, and the first that the data cannot
+    tell from the best one stands for them, see `views.excess`. It is taken only if it predicts
+    circles left out one by one better than the best of the RIVALS, by more than chance does: those
+    bend no further than circles and noises ask for, and need no row of circles left out to keep
+    them from bending between rows. Among these the first that cannot be told from the best.
     """
-    others = [c for c in candidates if c.name != CHALLENGER]
-    challenger = next((c for c in candidates if c.name == CHALLENGER), None)
-    if challenger is None:
+    rivals = [c for name in RIVALS for c in candidates if c.name == name]
+    others = [c for c in candidates if c.name not in RIVALS]
+    if not rivals:
         return _simplest(others)
+    best = min(rivals, key=lambda c: c.errors["leave_one_out"].mm)
+    rival = next(c for c in rivals if excess(c.left_one_out_mm, best.left_one_out_mm) <= 0.0)
+    said = [_reaches(c) for c in (rival, *(c for c in rivals if c is not rival))]
     if not others:
-        return challenger, "nothing else was tried"
+        return rival, f"held-out error {'; '.join(said)}"
     other, why = _simplest(others)
-    one, two = (c.errors["leave_one_out"].mm for c in (challenger, other))
-    if excess(challenger.left_one_out_mm, other.left_one_out_mm) > 0.0:
-        return other, f"{why}; the circles alone, without hand-eye, reach {one:.3f} mm"
-    return challenger, (
-        f"held-out error {one:.3f} mm by the circles alone, without hand-eye; {other.name}, which "
-        f"stands for the corrections of hand-eye's chain, reaches {two:.3f} mm"
-    )
+    if excess(rival.left_one_out_mm, other.left_one_out_mm) > 0.0:
+        return other, "; ".join([why, *said])
+    two = other.errors["leave_one_out"].mm
+    stands = f"{two:.3f} mm by {other.name}, which stands for the corrections of hand-eye's chain"
+    return rival, f"held-out error {'; '.join([*said, stands])}"
+
+
+def _reaches(candidate: Candidate) -> str:
+    return f"{candidate.errors['leave_one_out'].mm:.3f} mm {RIVALS[candidate.name]}"
 
 
 def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
@@ -162,6 +181,16 @@ def _candidate(
         for name, folds in (("one", np.arange(len(good))[None]), ("row", ways))
     }
     return Candidate.measured(family.name, number, found, predicted, marks, used, base)
+
+
+def _adjusted(
+    adjust: Adjust, marks: Sequence[Mark], drawn: Marks, used: Mask, base: Calibration
+) -> Candidate:
+    good = [mark for mark, ok in zip(marks, used, strict=True) if ok]
+    try:
+        return joint_candidate(adjust(good), drawn, used, base, rows(drawn[used].xy))
+    except SolveError as error:
+        return Candidate(JOINT, np.inf, error.message)
 
 
 def rows(xy: Array) -> Array:

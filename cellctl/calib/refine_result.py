@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from cellctl.calib.calibration import Calibration
+from cellctl.calib.joint.result import JointResult
 from cellctl.calib.refine_fit import Fit, Marks
 from cellctl.calib.refinement import Refinement
 from cellctl.calib.views import Rejection, rms
 from cellctl.geometry import Array, Mask
+
+JOINT = "joint adjustment"
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,8 @@ class RefineResult:
     drawing posture, with its covariance. `errors_mm` (n, 2) and `errors_px` are the fit's errors
     of all circles, predicted minus seen, on the table and in the projector; `used` (n,) those
     that it rests on. `mark_sigma_mm`: noise of a mark per axis, known with `mark_freedom` degrees
-    of freedom."""
+    of freedom. `joint`: the joint adjustment, chosen or not, if there was one; `refinement` goes
+    with its calibration when it was chosen."""
 
     refinement: Refinement
     tcp_mm: Array
@@ -121,6 +125,14 @@ class RefineResult:
     rejected: tuple[Rejection, ...]
     mark_sigma_mm: float
     mark_freedom: float
+    joint: JointResult | None = None
+
+    def calibration(self, base: Calibration) -> Calibration:
+        """`base` as the chosen candidate has it: corrected, or jointly adjusted. What `base` knows
+        of table and quality stays."""
+        if self.joint is not None and self.chosen == JOINT:
+            return replace(self.joint.calibration, surface=base.surface, quality=base.quality)
+        return replace(base, refinement=self.refinement)
 
     def candidate(self, name: str) -> Candidate:
         return next(c for c in self.candidates if c.name == name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from cellctl.calib.joint.observations import BoardViews, Circles, Lit, Observati
 from cellctl.calib.joint.result import JointResult
 from cellctl.calib.joint.solve import solve_joint
 from cellctl.calib.joint.uncertainty import Step
-from cellctl.calib.refine import solve_refine
+from cellctl.calib.refine import Adjust, solve_refine
 from cellctl.calib.refine_fit import Mark
 from cellctl.calib.views import RobotView
 from cellctl.config import CellConfig
@@ -70,12 +69,13 @@ def _kept(views: Sequence[RobotView], rejected: set[str]) -> list[RobotView]:
     return [view for view in views if view.id not in rejected]
 
 
-def adjusted(seen: Observations, start: Calibration) -> tuple[JointResult | None, str]:
-    """The joint adjustment, or None and why there is none: the parts stand without it."""
-    try:
-        return solve_joint(seen, start), ""
-    except SolveError as error:
-        return None, error.message
+def adjusting(optical: Optical, touches: Array, base: Calibration) -> Adjust:
+    """The joint adjustment of a run, from `base`, with those circles that agree."""
+
+    def adjust(marks: Sequence[Mark]) -> JointResult:
+        return solve_joint(observations(optical, touches, marks), base)
+
+    return adjust
 
 
 def places(config: CellConfig) -> Array:
@@ -155,8 +155,3 @@ def with_learning(data: dict[str, Any], held_out: dict[int, float]) -> dict[str,
         for step in data["curve"]
     ]
     return {**data, "curve": curve}
-
-
-def calibration(result: JointResult, base: Calibration) -> Calibration:
-    """The joint adjustment's calibration, with what `base` knows beside."""
-    return replace(result.calibration, surface=base.surface, quality=base.quality)

@@ -7,16 +7,23 @@ what the next one starts from. A pen or a sheet that fails ends the drawing, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from cellctl.calib.calibration import Calibration
+from cellctl.calib.joint.result import JointResult
+from cellctl.calib.refine_fit import Mark
 from cellctl.calib.refine_result import RefineResult
 from cellctl.calib.stages import Stage
 from cellctl.calib.table_surface import TableSurface
 from cellctl.cell import Cell
+from cellctl.config import CellConfig
 from cellctl.errors import SolveError
 from cellctl.procedures import (
+    accuracy,
     comparison,
     draw,
     drawn,
@@ -33,14 +40,14 @@ from cellctl.procedures.draw import DrawParams
 from cellctl.procedures.evaluate import EvaluateParams, Judged, Noise
 from cellctl.procedures.knowledge import Knowledge, known
 from cellctl.procedures.measure_table import MeasureTableParams
-from cellctl.procedures.optical import HAND_EYE, INTRINSIC, PROJECTOR, OpticalParams
+from cellctl.procedures.optical import HAND_EYE, INTRINSIC, PROJECTOR, Optical, OpticalParams
 from cellctl.procedures.pictures import PICTURES
 from cellctl.procedures.record import Record, recorded
 from cellctl.procedures.refine import RefineParams
 from cellctl.run import Procedure, Result, Run
 
 TABLE, DRAW, REFINE, EVALUATE = "measure-table", "draw", "refine", "evaluate"
-BASE, REFINED = "base", "refined"
+BASE, REFINED, ACCURACY = "base", "refined", "accuracy"
 
 
 class FullParams(OpticalParams):
@@ -115,7 +122,7 @@ def base_of(record: Record[FullParams]) -> Calibration | None:
 
 def refined_of(record: Record[FullParams], base: Calibration) -> Calibration | None:
     """Pure: the calibration that is evaluated; None when what was drawn has failed already."""
-    ink = _ink(record, base)
+    ink = _ink(record, base, optical.solve(record, record.params))
     return None if ink.reasons or ink.result is None else refine.refined(base, ink.result)
 
 
@@ -138,14 +145,16 @@ class Ink:
         return [*self.faults, *self.refusals]
 
 
-def _ink(record: Record[FullParams], base: Calibration) -> Ink:
+def _ink(record: Record[FullParams], base: Calibration, seen: Optical) -> Ink:
     """Pure: circles, their faults, and the correction."""
     found = draw.seen(record.scoped(DRAW, record.params.draw), base)
     faults = drawn.faults(found, base)
     marks = found.marks(base.camera)
     slips = refine.slipped(marks, base)
+    touches = measure_table.seen(record.scoped(TABLE, record.params.measure_table))
+    adjust = accuracy.adjusting(seen, np.array(list(touches.values())), base)
     try:
-        result = refine.solve(marks, base)
+        result = refine.solve(marks, base, adjust)
     except SolveError as error:
         return Ink(found, faults, slips or [error.message], None)
     return Ink(found, faults, refine.judge(result, record.params.refine, slips), result)
@@ -165,7 +174,7 @@ def conclude(record: Record[FullParams]) -> Result:
     }
     best = seen.calibration(table.plane).on(table)
     if record.scoped(DRAW, params.draw).samples(draw.CIRCLES):
-        best = _prove(record, best, stages, data, reasons)
+        best = _prove(record, best, seen, stages, data, reasons)
     for part, why in reasons.items():
         verdict = "fail" if why else "pass"
         data[part] = {"verdict": verdict, "reasons": list(why), **data.get(part, {})}
@@ -177,12 +186,13 @@ def conclude(record: Record[FullParams]) -> Result:
 def _prove(
     record: Record[FullParams],
     base: Calibration,
+    seen: Optical,
     stages: list[Stage],
     data: dict[str, Any],
     reasons: dict[str, tuple[str, ...]],
 ) -> Calibration:
     """What the circles say, into `data` and `reasons`; the calibration with their correction."""
-    ink = _ink(record, base)
+    ink = _ink(record, base, seen)
     data[DRAW], reasons[DRAW] = ink.drawn.to_dict(), tuple(ink.faults)
     reasons[REFINE] = tuple(ink.refusals)
     if ink.result is None:
@@ -194,9 +204,27 @@ def _prove(
     if judged is not None:
         data[EVALUATE] = judged.to_dict()
         best = replace(best, quality={**best.quality, **judged.quality()})
-    circles = comparison.Circles(ink.drawn.marks(base.camera), judged, best, ink.result.tcp_mm)
+    marks = ink.drawn.marks(base.camera)
+    if ink.result.joint is not None:
+        data[ACCURACY] = _accuracy(record.config, ink.result.joint, marks, judged, base, best)
+    circles = comparison.Circles(marks, judged, best, ink.result.tcp_mm)
     data.update(comparison.table(stages, circles, record.config.robot.arm))
     return best
+
+
+def _accuracy(
+    config: CellConfig,
+    joint: JointResult,
+    marks: Sequence[Mark],
+    judged: Judged | None,
+    base: Calibration,
+    best: Calibration,
+) -> dict[str, Any]:
+    """What error to expect, and what was measured with fewer circles."""
+    told = accuracy.told(joint, accuracy.places(config))
+    if judged is None:
+        return told
+    return accuracy.with_learning(told, accuracy.learning(marks, judged, base, best))
 
 
 def _evaluated(

@@ -37,12 +37,14 @@ class RefineParams(BaseModel):
     max_tcp_off_mm: float = Field(default=3.0, gt=0)
 
 
-def solve(circles: list[Mark], base: Calibration) -> RefineResult:
-    """Pure: the correction and the pen's offset. SolveError when the circles contradict each
-    other."""
+def solve(
+    circles: list[Mark], base: Calibration, adjust: refine.Adjust | None = None
+) -> RefineResult:
+    """Pure: the correction and the pen's offset; `adjust` makes the joint adjustment of the run a
+    candidate. SolveError when the circles contradict each other."""
     covariance = base.quality.get("hand_eye_covariance")
     pose = None if covariance is None else np.array(covariance)[:6, :6]
-    return refine.solve_refine(circles, base, pose_covariance=pose)
+    return refine.solve_refine(circles, base, pose_covariance=pose, adjust=adjust)
 
 
 def slipped(circles: list[Mark], base: Calibration) -> list[str]:
@@ -74,7 +76,7 @@ def refined(base: Calibration, result: RefineResult) -> Calibration:
         "mark_sigma_mm": float(result.mark_sigma_mm),
         "mark_freedom": float(result.mark_freedom),
     }
-    return replace(base, refinement=result.refinement, quality=quality)
+    return replace(result.calibration(base), quality=quality)
 
 
 def result_data(result: RefineResult) -> dict[str, Any]:

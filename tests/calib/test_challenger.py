@@ -125,7 +125,7 @@ def test_another_must_be_better_beyond_chance(cell, marks):
     better = replace(better, held_out_mm=third, left_one_out_mm=third)
     chosen, why = choose([better, challenger])
     assert chosen is better
-    assert "the circles alone, without hand-eye, reach" in why
+    assert "mm by the circles alone, without hand-eye" in why
     alone, why = choose([challenger])
     assert alone is challenger
     assert why == "nothing else was tried"

@@ -12,13 +12,11 @@ from cellctl.calib.joint.observations import Circles
 from cellctl.calib.joint.pictures import pen
 from cellctl.calib.joint.result import JointResult
 from cellctl.calib.refine_fit import Fit, Marks, rotations
-from cellctl.calib.refine_result import Candidate
+from cellctl.calib.refine_result import JOINT, Candidate
 from cellctl.calib.refinement import Refinement
 from cellctl.calib.schur import inverse_of
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
-
-NAME = "joint adjustment"
 
 
 def predict(result: JointResult, circles: Circles) -> Array:
@@ -74,7 +72,7 @@ def joint_candidate(
         seen = [base.camera.normalise(one) for one in pixels]
         predicted[used] = np.stack(seen, axis=2)
         held_out[name] = predicted
-    return Candidate.measured(NAME, 1.0, fit, held_out, marks, used, base)
+    return Candidate.measured(JOINT, 1.0, fit, held_out, marks, used, base)
 
 
 @dataclass(frozen=True, eq=False)
