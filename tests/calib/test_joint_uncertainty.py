@@ -17,6 +17,7 @@ from cellctl.calib.joint.solve import solve_joint
 from cellctl.calib.joint.state import JointState
 from cellctl.calib.joint.uncertainty import curve, error_map, what_next
 from cellctl.calib.pose import pose_matrices, pose_vectors
+from cellctl.calib.projector_map import ProjectorMap
 from cellctl.calib.schur import inverse_of
 from cellctl.geometry import Array, invert
 from tests.calib.joint_world import JointWorld, joint_world, true_pose_error, true_tcp
@@ -103,6 +104,8 @@ def off_by(found: JointState, truth: JointState, name: str) -> Array:
         return found.tcp - truth.tcp
     if name == "table":
         return found.table.coefficients - truth.table.coefficients
+    assert isinstance(found.projector, ProjectorMap)
+    assert isinstance(truth.projector, ProjectorMap)
     step = np.zeros(12)
     step[8:10] = found.projector.radial - truth.projector.radial
     return step
