@@ -9,6 +9,7 @@ import pytest
 
 from cellctl.calib.joint.observations import Observations
 from cellctl.calib.joint.problem import JointProblem
+from cellctl.calib.joint.solve import solve_joint
 from cellctl.calib.joint.start import JointOptions, begin
 from cellctl.calib.joint.state import FullProjector, JointState
 from cellctl.calib.pose import pose_matrices

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cellctl.calib.joint.held_out import held_out_pixels, predict
+from cellctl.calib.joint.held_out import held_out_pixels, joint_candidate, predict
 from cellctl.calib.joint.observations import Observations
 from cellctl.calib.joint.pictures import light_on_table, pen, world_camera
 from cellctl.calib.joint.problem import ROBOT_COMMON, JointProblem
@@ -18,7 +18,10 @@ from cellctl.calib.joint.state import JointState
 from cellctl.calib.joint.uncertainty import curve, error_map, what_next
 from cellctl.calib.pose import pose_matrices, pose_vectors
 from cellctl.calib.projector_map import ProjectorMap
+from cellctl.calib.refine import rows
+from cellctl.calib.refine_fit import Mark, Marks
 from cellctl.calib.schur import inverse_of
+from cellctl.errors import SolveError
 from cellctl.geometry import Array, invert
 from tests.calib.joint_world import JointWorld, joint_world, true_pose_error, true_tcp
 
@@ -200,3 +203,20 @@ def test_the_calibration_says_what_the_adjustment_says(world, result):
     assert np.abs(gaps_mm(result.problem, result.state, result, places)).max() < 2e-3
     T = world_camera(result.state, result.problem.look)
     assert np.allclose(T, result.calibration.T_world_camera.matrix)
+
+
+def test_it_stands_beside_the_corrections(world, result):
+    """In the base's coordinates, by the same measure, with the pen's offset and its noise."""
+    base, circles = world.start, world.seen.circles
+    seen = base.camera.normalise(circles.pixels)
+    rows_of = zip(circles.keys, circles.xy, circles.yaw, seen, strict=True)
+    marks = Marks.of([Mark(key, xy, float(yaw), at) for key, xy, yaw, at in rows_of], base)
+    used = np.ones(len(marks), dtype=bool)
+    candidate = joint_candidate(result, marks, used, base, rows(marks.xy))
+    assert candidate.errors["training"].mm < candidate.errors["leave_one_out"].mm < 0.5
+    assert candidate.errors["leave_one_out"].mm <= candidate.errors["leave_row_out"].mm * 1.1
+    assert candidate.fit is not None
+    assert np.allclose(candidate.fit.predict(marks), seen, atol=2e-3)
+    assert 30 < candidate.fit.freedom < 2 * len(marks)
+    with pytest.raises(SolveError, match="other circles"):
+        joint_candidate(result, marks, ~used, base, rows(marks.xy))
