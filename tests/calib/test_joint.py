@@ -132,6 +132,6 @@ def test_a_camera_on_the_arm_is_solved_too(world):
 def test_bad_input_is_named(world):
     with pytest.raises(BadInput, match="different names"):
         replace(world.seen, views=[world.seen.views[0]] * 2)
+    lost = replace(world.seen, lit_boards=[replace(world.seen.lit_boards[0], view="nowhere")])
     with pytest.raises(BadInput, match="no view"):
-        lit = [replace(world.seen.lit_boards[0], view="nowhere")]
-        solve_joint(replace(world.seen, lit_boards=lit), world.start, area=world.area)
+        solve_joint(lost, world.start, area=world.area)
