@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
-	format-fix soak-kill soak-faults soak-demo soak-core bench-render
+	format-fix soak-kill soak-faults soak-demo soak-core bench-render bench-solvers
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -61,6 +61,9 @@ soak-core: install ## Kill the engine with a toy procedure KILLS times
 
 bench-render: install ## Milliseconds a rendered picture
 	$(BIN)/python -m benchmarks.render
+
+bench-solvers: install ## The adjustments against OpenCV and SciPy
+	$(BIN)/python -m benchmarks.solvers
 
 format-fix: install ## Let ruff format
 	$(BIN)/ruff format

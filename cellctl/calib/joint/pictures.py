@@ -46,8 +46,7 @@ def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Ar
     by_world = by_camera @ T[:3, :3].T
     seen, by_plain = plain, np.broadcast_to(np.eye(2), (len(xy), 2, 2))
     if field is not None:
-        displaced = field.refinement(state.field)
-        seen, by_plain = displaced.apply(plain), displaced.slopes(displaced.scaled(plain))
+        seen, by_plain, by_field = field.displaced(plain, state.field)
     g = by_plain @ by_world
     in_plane = g[..., :2] + g[..., 2:] * state.table.slopes(place)[:, None]
     slopes = _of_camera_pose(state, by_plain @ by_camera, in_camera)
@@ -55,7 +54,7 @@ def pen(state: JointState, look: Array, field: Field | None, xy: Array, turn: Ar
     slopes["tcp"] = in_plane @ turn
     slopes["place"] = in_plane
     if field is not None:
-        slopes["field"] = field.slopes(plain)
+        slopes["field"] = by_field
     return Picture(seen, slopes)
 
 
@@ -67,10 +66,9 @@ def light_on_table(state: JointState, look: Array, field: Field | None, pixels: 
         plain = _by_rays(state, look, pixels)
     if field is None:
         return plain
-    bend = field.refinement(state.bend)
-    by_plain = bend.slopes(bend.scaled(plain.xy))
+    xy, by_plain, by_bend = field.displaced(plain.xy, state.bend)
     slopes = {name: by_plain @ slope for name, slope in plain.slopes.items()}
-    return Picture(bend.apply(plain.xy), {**slopes, "bend": field.slopes(plain.xy)})
+    return Picture(xy, {**slopes, "bend": by_bend})
 
 
 def _by_rays(state: JointState, look: Array, pixels: Array) -> Picture:

@@ -115,8 +115,18 @@ class JointProblem:
         found = {group.name: self._views(group, state) for group in self.groups}
         return found | self.global_parts(state)
 
+    @cached_property
+    def _latest(self) -> list[tuple[JointState, dict[str, Linearised]]]:
+        return []
+
     def global_parts(self, state: JointState) -> dict[str, Linearised]:
-        """What is not a view of a board."""
+        """What is not a view of a board. That of the latest state is kept: its cost is asked for
+        first, and its derivatives when the step was good."""
+        if not (self._latest and self._latest[0][0] is state):
+            self._latest[:] = [(state, self._global_parts(state))]
+        return self._latest[0][1]
+
+    def _global_parts(self, state: JointState) -> dict[str, Linearised]:
         found: dict[str, Linearised] = {}
         if len(self.touches):
             found["touch"] = self._touches(state)

@@ -13,7 +13,7 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.plane import Plane
 from cellctl.calib.pose import pose_matrices
 from cellctl.calib.projector_map import ProjectorMap
-from cellctl.calib.refinement import Refinement, kernel_values
+from cellctl.calib.refinement import Refinement
 from cellctl.calib.table_surface import TERMS, Area, basis
 from cellctl.geometry import Array, invert
 
@@ -119,16 +119,20 @@ class Field:
     def count(self) -> int:
         return int(self.modes.shape[1])
 
-    def values(self, xy: Array) -> Array:
-        """(n, m): what unit coefficients displace camera coordinates (n, 2) by, per mm."""
+    def displaced(self, xy: Array, coefficients: Array) -> tuple[Array, Array, Array]:
+        """Camera coordinates (n, 2) displaced, as `refinement` does it, with the derivatives by xy
+        (n, 2, 2) and by the coefficients (n, 2, 2 m)."""
         u = (xy - self.centre) / self.scale
-        phi = kernel_values("rbf", self.length, u, self.nodes)
-        return phi @ self.modes * (self.scale / self.mm)
-
-    def slopes(self, xy: Array) -> Array:
-        """`values` as derivatives (n, 2, 2 m) of both coordinates by all coefficients."""
-        both = self.values(xy)[:, None, :, None] * np.eye(2)[:, None, :]
-        return both.reshape(len(xy), 2, -1)
+        r2 = np.square(u).sum(axis=1)[:, None] - 2.0 * u @ self.nodes.T
+        phi = np.exp(-0.5 * (r2 + np.square(self.nodes).sum(axis=1)) / self.length**2)
+        weights = self.modes @ coefficients / self.mm
+        moved = phi @ weights
+        pulled = phi @ (weights[:, :, None] * self.nodes[:, None]).reshape(-1, 4)
+        by_u = (pulled.reshape(-1, 2, 2) - moved[:, :, None] * u[:, None]) / self.length**2
+        values = phi @ self.modes * (self.scale / self.mm)
+        both = np.zeros((len(xy), 2, self.count, 2))
+        both[:, 0, :, 0] = both[:, 1, :, 1] = values
+        return xy + self.scale * moved, np.eye(2) + by_u, both.reshape(len(xy), 2, -1)
 
     def refinement(self, coefficients: Array) -> Refinement:
         """The displacement with coefficients (m, 2) in mm, as calibrations store it."""
