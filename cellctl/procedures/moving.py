@@ -12,7 +12,7 @@ from cellctl.drivers.base import Path, RobotState, Stroke, Target
 from cellctl.errors import MotionRefused
 from cellctl.geometry import Array
 from cellctl.procedures import pen
-from cellctl.procedures.planning import reach, retrace
+from cellctl.procedures.planning import reach
 from cellctl.run import Run
 from cellctl.store.history import Sample
 
@@ -47,9 +47,7 @@ async def go(run: Run, cell: Cell, way: Array, hubs: Array) -> tuple[RobotState,
     MotionRefused when there is no path."""
     await lift_pen(run, cell)
     here = (await cell.robot.read()).joints
-    path: Path | None = await run.call(reach, cell.guard, here, way, hubs)
-    if path is None:
-        path = await run.call(retrace, cell.guard, here, way[-1], gone(run))
+    path: Path | None = await run.call(reach, cell.guard, here, way, hubs, gone(run))
     if path is None:
         degrees = ", ".join(f"{v:.1f}" for v in np.degrees(way[-1]))
         raise MotionRefused(f"no allowed path leads to joints {degrees} deg; nothing has moved")

@@ -29,6 +29,7 @@ SEARCH_CHOICES = 24
 CONNECT_TRIES = 5
 HUBS_TRIED = 12
 BRIDGES = 2
+NOWHERE = np.empty((0, JOINTS))
 ENOUGH_CHOICE, CHOICE_PER_VIEW = 60, 6
 CANDIDATES, CANDIDATES_PER_VIEW = 400, 12
 PLACING_ROUNDS = 3
@@ -293,11 +294,13 @@ def first_reached(
     return None
 
 
-def reach(guard: Guard, here: Array, way: Array, hubs: Array) -> Path | None:
-    """An allowed path from `here` to the end of `way` (n, 6), if need be over `hubs` (m, 6).
+def reach(guard: Guard, here: Array, way: Array, hubs: Array, came: Array = NOWHERE) -> Path | None:
+    """An allowed path from `here` to the end of `way` (n, 6), if need be over `hubs` (m, 6), or
+    back over the postures `came` (k, 6) which the arm has come by, oldest first.
 
-    Tried in this order: straight, by the way as it was planned, over one hub, over several, by
-    RRT-Connect, by RRT-Connect to hubs and over these.
+    Tried in this order, the quickest to find first: straight, by the way as it was planned, over
+    one hub, back where the arm came from, over several hubs, by RRT-Connect, by RRT-Connect to
+    hubs and over these.
     """
     goal = way[-1]
     direct, planned = Path(goal[None]), Path(way)
@@ -306,22 +309,34 @@ def reach(guard: Guard, here: Array, way: Array, hubs: Array) -> Path | None:
         return direct
     if guard.allows(here, planned):
         return planned
-    return _detour(cautious, here, goal, hubs)
+    return (
+        _over_one(guard, here, goal, hubs)
+        or retrace(guard, here, goal, came)
+        or _over_several(cautious, here, goal, hubs)
+        or _searched(cautious, here, goal, hubs)
+    )
 
 
-def _detour(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
+def _over_one(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
     legs = np.abs(hubs - here).max(axis=1) + np.abs(hubs - goal).max(axis=1)
     for hub in hubs[np.argsort(legs, kind="stable")[:HUBS_TRIED]]:
         detour = Path(np.array([hub, goal]))
         if guard.allows(here, detour):
             return detour
-    road = Roadmap(guard, here, np.vstack([goal[None], hubs]))
-    if 0 in road.index:
-        return road.path(here, road.index[0])
+    return None
+
+
+def _over_several(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
+    road = Roadmap(guard, here, np.vstack([goal[None], hubs]), until=0)
+    return road.path(here, road.index[0]) if 0 in road.index else None
+
+
+def _searched(guard: Guard, here: Array, goal: Array, hubs: Array) -> Path | None:
     found = connect(guard, here, goal)
+    road = Roadmap(guard, here, np.vstack([goal[None], hubs]), until=0) if found is None else None
     for _ in range(BRIDGES):
-        if found is None and road.bridge() and 0 in road.index:
-            found = road.path(here, road.index[0])
+        if road is not None and road.bridge() and 0 in road.index:
+            return road.path(here, road.index[0])
     return found
 
 

@@ -52,10 +52,14 @@ class Roadmap:
     """Postures `nodes` (n, 6) joined to `root` (6,) by free joint lines, as a tree.
 
     Grown nearest node first (Prim), so that neighbours on the tree are near in joint space.
-    `index` maps a reached node's number to its place on the tree.
+    `index` maps a reached node's number to its place on the tree. Once the node number `until` is
+    reached it grows no further.
     """
 
-    def __init__(self, guard: Guard, root: Array, nodes: Array) -> None:
+    def __init__(
+        self, guard: Guard, root: Array, nodes: Array, *, until: int | None = None
+    ) -> None:
+        self._until = until
         self.guard, self.tree, self.nodes = guard, Tree(root), nodes
         self.index: dict[int, int] = {}
         self._tried: list[set[int]] = [set() for _ in nodes]
@@ -99,7 +103,7 @@ class Roadmap:
     def _grow(self) -> None:
         left = [i for i in range(len(self.nodes)) if i not in self.index]
         gap = {i: self._gap(self.nodes[i]) for i in left}
-        while gap:
+        while gap and self._until not in self.index:
             i = min(gap, key=lambda k: (gap[k], k))
             if not np.isfinite(gap[i]):
                 return
