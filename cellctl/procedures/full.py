@@ -80,7 +80,8 @@ async def _look(run: Run, cell: Cell, params: FullParams) -> None:
     belief = await intrinsic.collect(run.scope(INTRINSIC), cell, params.intrinsic, belief)
     belief = await run.call(_next_belief, _record(run, cell, params), start, belief)
     belief = await hand_eye.collect(run.scope(HAND_EYE), cell, params.hand_eye, belief)
-    found = Knowledge(belief.camera, belief.T_world_camera, calibrated=True, boards={})
+    boards = {hand_eye.BOARD: belief.T_flange_board}
+    found = Knowledge(belief.camera, belief.T_world_camera, calibrated=True, boards=boards)
     await projector.collect(run.scope(PROJECTOR), cell, params.projector, found)
 
 
@@ -168,11 +169,15 @@ def conclude(record: Record[FullParams]) -> Result:
     stages = seen.stages(record.config)
     reasons = dict(seen.judged(params))
     reasons[TABLE] = measure_table.judge(table, params.measure_table)[1]
+    best = seen.calibration(table.plane).on(table)
     data: dict[str, Any] = {
         **seen.data(),
         TABLE: measure_table.told(record.scoped(TABLE, params.measure_table), table),
     }
-    best = seen.calibration(table.plane).on(table)
+    if params.projector.held:
+        light = record.scoped(PROJECTOR, params.projector)
+        data[PROJECTOR]["full_model"], why = projector.full_model(light, best, seen.shown)
+        reasons[PROJECTOR] = (*reasons[PROJECTOR], *why)
     if record.scoped(DRAW, params.draw).samples(draw.CIRCLES):
         best = _prove(record, best, seen, stages, data, reasons)
     for part, why in reasons.items():

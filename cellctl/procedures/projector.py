@@ -20,10 +20,11 @@ from cellctl.calib.calibration import Calibration
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.dense import CodeSeen
 from cellctl.calib.projector import LensPrior, ProjectorResult
+from cellctl.calib.second_plane import LitPlane, full_projector
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
-from cellctl.errors import DeviceFault
-from cellctl.procedures import light_code
+from cellctl.errors import BadInput, DeviceFault, SolveError
+from cellctl.procedures import light_code, lit_board
 from cellctl.procedures.capture import darken, grab_still, mean_image
 from cellctl.procedures.knowledge import Knowledge, known, lens_prior, table_plane
 from cellctl.procedures.observations import picture
@@ -42,7 +43,8 @@ Markers = dict[int, Any]
 
 class ProjectorParams(BaseModel):
     """The grid of markers and in how many pictures it is shown; or, `dense`, a Gray code whose
-    finest stripes are `stripe_px` projector pixels wide."""
+    finest stripes are `stripe_px` projector pixels wide. So many times the marker board is `held`
+    into the light, which shows the projector's full model; that needs a hand-eye."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -51,6 +53,7 @@ class ProjectorParams(BaseModel):
     pictures: int = Field(default=4, ge=1, le=16)
     dense: bool = False
     stripe_px: int = Field(default=8, ge=2, le=64)
+    held: int = Field(default=0, ge=0, le=20)
     max_held_out_px: float = Field(default=2.0, gt=0)
     max_shift_px: float = Field(default=0.3, gt=0)
 
@@ -75,7 +78,10 @@ def pictures_of(config: CellConfig, params: ProjectorParams) -> list[patterns.Ma
 
 
 async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
-    """Park the arm, show all pictures, and the first one again."""
+    """Park the arm, show all pictures, and the first one again; then hold the marker board into
+    the light. BadInput when it is not known how the arm holds it."""
+    if params.held and lit_board.BOARD not in knowledge.boards:
+        raise BadInput("held: how the arm holds the marker board is not known yet; run full first")
     shown = pictures_of(cell.config, params)
     if not run.samples(AGAIN):
         await park(run, cell, knowledge.T_world_camera, PICTURES)
@@ -86,6 +92,9 @@ async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Know
         await _take(run, cell, PICTURES, shown)
     await _take(run, cell, AGAIN, shown[:1])
     await darken(cell)
+    if params.held:
+        belief = knowledge.belief(cell.config, lit_board.BOARD)
+        await lit_board.collect(run, cell, belief, params.held, params.stripe_px)
 
 
 async def look_before(run: Run, cell: Cell, params: ProjectorParams, knowledge: Knowledge) -> None:
@@ -202,12 +211,36 @@ def conclude(record: Record[ProjectorParams]) -> Result:
     result = solve(shown, knowledge.camera, lens_prior(record.config))
     _, reasons = judge(result, shown, record.params)
     data = {"kind": "projector", **result.to_dict()}
-    return Result.judged(reasons, data, _calibration(record.config, knowledge, result))
+    calibration = _calibration(record.config, knowledge, result)
+    if calibration is not None and record.params.held:
+        data["full_model"], why = full_model(record, calibration, shown)
+        reasons = (*reasons, *why)
+    return Result.judged(reasons, data, calibration.to_dict() if calibration else None)
+
+
+def full_model(
+    record: Record[ProjectorParams], calibration: Calibration, shown: Shown
+) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
+    """Pure: the projector in the robot's frame, from the table and the boards that were held into
+    the light; None, and why, when these do not tell it."""
+    pose, board = calibration.T_world_camera, calibration.boards[lit_board.BOARD]
+    lit = [(shown.centres[n], place) for p in shown.pictures for n, place in p.items()]
+    pixels, places = (np.array(side) for side in zip(*lit, strict=True))
+    planes = [
+        LitPlane("table", pixels, places, calibration.table_frame),
+        *lit_board.seen(record, pose, board),
+    ]
+    size, lens = record.config.projector.size_px, lens_prior(record.config)
+    try:
+        found = full_projector(planes, calibration.camera, pose, size, lens)
+    except SolveError as error:
+        return None, (error.message,)
+    return found.to_dict(), ()
 
 
 def _calibration(
     config: CellConfig, knowledge: Knowledge, result: ProjectorResult
-) -> dict[str, Any] | None:
+) -> Calibration | None:
     """The active calibration with this projector; None when there was none."""
     if not knowledge.calibrated:
         return None
@@ -217,7 +250,7 @@ def _calibration(
         table=table_plane(config),
         projector=result.map,
         boards=knowledge.boards,
-    ).to_dict()
+    )
 
 
 async def run_projector(run: Run, cell: Cell, params: ProjectorParams) -> Result:

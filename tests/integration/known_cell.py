@@ -61,7 +61,10 @@ def known_calibration(truth: Truth, *, bow_m: float = 0.0) -> Calibration:
     pose = truth.camera.pose @ Transform.from_rvec("camera", "camera", turn, shift)
     level = Plane.horizontal(touched_height(truth))
     light = _light(truth, camera, rng)
-    known = Calibration(camera=camera, T_world_camera=pose, table=level, projector=light)
+    boards = {"markers": truth.boards["markers"].pose}
+    known = Calibration(
+        camera=camera, T_world_camera=pose, table=level, projector=light, boards=boards
+    )
     return known.on(_surface(truth, bow_m, rng))
 
 
