@@ -41,6 +41,7 @@ from cellctl.calib.hand_eye_fit import (
     estimate_noise,
     options,
     possible_poses,
+    predicted,
 )
 from cellctl.calib.hand_eye_result import HandEyeLimits, HandEyeResult, HandEyeView, judge
 from cellctl.calib.intrinsic import best_camera
@@ -237,7 +238,9 @@ def _result(
     chosen, why = choose(candidates)
     data, state = job.data, chosen.state
     names = {view.id for view in data.views}
-    others = [_predicted(view, job, state) for view in every if view.id not in names]
+    others = [
+        predicted(view, state, data.mount, data.sheet) for view in every if view.id not in names
+    ]
     anchor, mount = _frames(data)
     return HandEyeResult(
         mount=data.mount,
@@ -250,6 +253,7 @@ def _result(
         candidates=tuple(candidates),
         scale=float(np.exp(state.log_scale)),
         warp=state.warp,
+        sheet=data.sheet,
         robot_sigma=job.noise.robot,
         axis_scatter_deg=axis_scatter_deg(data.reported),
         rms_px=chosen.rms_px,
@@ -281,18 +285,6 @@ def _views(data: RobotData, chosen: Candidate) -> tuple[HandEyeView, ...]:
         )
         for i, view in enumerate(data.views)
     )
-
-
-def _predicted(view: RobotView, job: Job, state: ChainState) -> Array:
-    """Errors (k, 2) of a view that the fit does not rest on, in its best orientation. What would
-    lie behind the camera counts as a picture's diagonal."""
-    diagonal = float(np.linalg.norm(state.camera.image_size))
-    found = []
-    for turn in view.symmetries:
-        turned = replace(view, points=transform_points(turn, view.points))
-        one = RobotData((turned,), job.data.mount, job.data.sheet)
-        found.append(np.nan_to_num(one.through_robot(state)[0], nan=diagonal))
-    return min(found, key=rms)
 
 
 def _spread(data: RobotData, state: ChainState) -> tuple[Array, Array]:

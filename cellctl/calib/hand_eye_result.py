@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
+from cellctl.calib.chain import ChainState, Sheet
 from cellctl.calib.hand_eye_choice import Candidate
 from cellctl.calib.hand_eye_fit import Mount
 from cellctl.calib.views import Rejection, shortage
@@ -37,6 +38,7 @@ class HandEyeResult:
     """`camera_pose` is T_base_camera or T_flange_camera, `board_pose` T_flange_board or
     T_base_board. `covariance` (12, 12) is that of small turns (rad) and shifts (m) of both, each
     in its own child frame. `candidates` are all ways that were tried; `why` says why `chosen`.
+    `scale` and `warp` are those of the board, over its `sheet`: see chain.Sheet.
     """
 
     mount: Mount
@@ -49,6 +51,7 @@ class HandEyeResult:
     candidates: tuple[Candidate, ...]
     scale: float
     warp: Array
+    sheet: Sheet
     robot_sigma: Array
     axis_scatter_deg: Array
     rms_px: float
@@ -56,6 +59,18 @@ class HandEyeResult:
     held_out_used_px: float
     views: tuple[HandEyeView, ...]
     rejected: tuple[Rejection, ...]
+
+    @property
+    def state(self) -> ChainState:
+        """The chain, without corrections of any view."""
+        return ChainState(
+            self.camera,
+            self.camera_pose.matrix,
+            self.board_pose.matrix,
+            np.zeros((0, 4, 4)),
+            float(np.log(self.scale)),
+            self.warp,
+        )
 
     @property
     def summary(self) -> dict[str, float]:
