@@ -8,7 +8,7 @@ reprojection errors; the error on views that a solution has not seen decides bet
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,14 +20,24 @@ from cellctl.calib.camera_fit import (
     require_views,
     usable_views,
 )
-from cellctl.calib.chain import ChainState, Free
+from cellctl.calib.chain import ChainState, Free, Sheet
 from cellctl.calib.closed_form import (
     axis_scatter_deg,
     consistent_options,
     discrepancies,
     robust_start,
+    scaled,
+    scaled_start,
 )
+from cellctl.calib.drift import Drift, find_drift
 from cellctl.calib.hand_eye_choice import Candidate, choose, evaluate, leave_one_out
+from cellctl.calib.hand_eye_faults import (
+    Evidence,
+    SolvedChain,
+    board_factor,
+    explained,
+    require_sense,
+)
 from cellctl.calib.hand_eye_fit import (
     ROBOT_SIGMA,
     Job,
@@ -84,39 +94,88 @@ def solve_hand_eye(
     every = ordered(views)
     usable, rejected = usable_views(every, minimum_points)
     require_views(usable, rejected, NEED)
-    job, disagreeing = _job(usable, mount, camera, image_size, priors, minimum_points)
+    sight = _sight(usable, camera, image_size, minimum_points)
+    rejected = [*rejected, *sight.lost]
+    require_views(sight.views, rejected, NEED)
+    job, gross, factor = _job(sight, mount, priors)
     job, strained = _without_strained(job)
-    rejected = sorted([*rejected, *disagreeing, *strained], key=lambda r: r.id)
-    require_views(job.data.views, rejected, NEED)
-    result = _result(job, every, _candidates(job), board)
+    require_views(job.data.views, [*rejected, *gross, *strained], NEED)
+    wrong = _explained(job, sight, [*gross, *strained], factor)
+    rejected = sorted([*rejected, *wrong], key=lambda r: r.id)
+    result = _result(job, every, _candidates(job), board, factor)
     return replace(result, rejected=tuple(rejected))
 
 
-def _job(
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What pictures alone say: the camera (and its fit, if it comes from them), what each allows
+    by its id, the views without a pose, and the bend of the board."""
+
+    camera: CameraModel
+    fit: CameraFit | None
+    found: dict[str, Possible]
+    lost: list[Rejection]
+    warp: Array
+
+    @property
+    def views(self) -> list[RobotView]:
+        return [possible[0][0] for possible in self.found.values()]
+
+
+def _sight(
     views: list[RobotView],
-    mount: Mount,
     camera: CameraModel | None,
     image_size: tuple[int, int] | None,
-    priors: PosePriors,
     minimum_points: int,
-) -> tuple[Job, list[Rejection]]:
-    """Camera, poses of the board in it, orientation of the board, start; gross errors out."""
+) -> _Sight:
     if camera is not None:
-        fit, rejected, warp = None, list[Rejection](), np.zeros(3)
-        found, lost = possible_poses(views, camera)
-    else:
-        fit, rejected = _camera_of(views, image_size, minimum_points)
-        fit, found, lost = located(views, fit)
-        camera, warp = fit.camera, fit.state.warp
-    rejected = [*rejected, *lost]
-    require_views([view for view in views if view.id in found], rejected, NEED)
-    views, boards, noise = _oriented(list(found.values()), mount, camera)
+        return _Sight(camera, None, *possible_poses(views, camera), np.zeros(3))
+    fit, rejected = _camera_of(views, image_size, minimum_points)
+    fit, found, lost = located(views, fit)
+    return _Sight(fit.camera, fit, found, [*rejected, *lost], fit.state.warp)
+
+
+def _job(sight: _Sight, mount: Mount, priors: PosePriors) -> tuple[Job, list[Rejection], float]:
+    """Orientation of the board, start; gross errors out; and the factor by which the board was
+    enlarged because it is another one than stated."""
+    views, boards, noise = _oriented(list(sight.found.values()), mount, sight.camera)
     data = RobotData.of(views, mount)
+    start = scaled_start(data.reported, boards)
+    require_sense(Evidence.of(list(sight.found.values()), mount), start)
+    factor = board_factor(start)
+    fit, boards, warp = sight.fit, scaled(boards, factor), factor * sight.warp
+    if factor != 1.0:
+        views = [replace(view, points=factor * view.points) for view in views]
+        data = RobotData.of(views, mount)
+        fit = fit and fit.rescaled(factor)
     X, Y = robust_start(data.reported, boards)
-    start = ChainState(camera, X, Y, data.no_corrections, warp=warp)
+    state = ChainState(sight.camera, X, Y, data.no_corrections, warp=warp)
     noise = fit.sigma_px if fit else noise
-    job, gross = _without_gross(Job(data, boards, start, Noise(noise, ROBOT_SIGMA), priors, fit))
-    return estimate_noise(job), [*rejected, *gross]
+    job, gross = _without_gross(Job(data, boards, state, Noise(noise, ROBOT_SIGMA), priors, fit))
+    return estimate_noise(job), gross, factor
+
+
+def _explained(
+    job: Job, sight: _Sight, rejected: list[Rejection], factor: float
+) -> list[Rejection]:
+    """With what has happened to views whose robot pose does not fit."""
+    if not rejected:
+        return []
+    state, data = job.start, job.data
+    shifts, angles = discrepancies(state.camera_pose, state.board_pose, data.reported, job.boards)
+    chain = SolvedChain(
+        state.camera_pose,
+        state.board_pose,
+        data.mount,
+        float(np.median(shifts)),
+        float(np.median(angles)),
+    )
+    possible = {
+        name: scaled(np.stack([pose.matrix for _, pose in options]), factor)
+        for name, options in sight.found.items()
+    }
+    points = factor * np.concatenate([view.points for view in sight.views])
+    return explained(chain, rejected, sight.views, possible, np.unique(points, axis=0))
 
 
 def _camera_of(
@@ -232,15 +291,19 @@ def _candidates(job: Job) -> list[Candidate]:
 
 
 def _result(
-    job: Job, every: Sequence[RobotView], candidates: Sequence[Candidate], board: str
+    job: Job,
+    every: Sequence[RobotView],
+    candidates: Sequence[Candidate],
+    board: str,
+    factor: float,
 ) -> HandEyeResult:
     """All that can be said about the chosen candidate; rejections are added by the caller."""
     chosen, why = choose(candidates)
     data, state = job.data, chosen.state
     names = {view.id for view in data.views}
-    others = [
-        predicted(view, state, data.mount, data.sheet) for view in every if view.id not in names
-    ]
+    sheet = Sheet(data.sheet.centre / factor, data.sheet.half / factor)
+    whole = replace(state, log_scale=state.log_scale + float(np.log(factor)))
+    others = [predicted(view, whole, data.mount, sheet) for view in every if view.id not in names]
     anchor, mount = _frames(data)
     return HandEyeResult(
         mount=data.mount,
@@ -251,9 +314,10 @@ def _result(
         chosen=chosen.option.name,
         why=why,
         candidates=tuple(candidates),
-        scale=float(np.exp(state.log_scale)),
+        scale=float(np.exp(whole.log_scale)),
         warp=state.warp,
-        sheet=data.sheet,
+        sheet=sheet,
+        pitch_m=_pitch(every),
         robot_sigma=job.noise.robot,
         axis_scatter_deg=axis_scatter_deg(data.reported),
         rms_px=chosen.rms_px,
@@ -261,7 +325,28 @@ def _result(
         held_out_used_px=chosen.held_out_px,
         views=_views(data, chosen),
         rejected=(),
+        drift=_drift(job),
     )
+
+
+def _drift(job: Job) -> Drift | None:
+    """What pictures and robot disagree about, at the middle of the board, view by view."""
+    state, data = job.start, job.data
+    chain = data.chain(Free())
+    D = state.corrections
+    middle = transform_points(state.board_pose, np.append(data.sheet.centre, 0.0))
+    at = chain.after @ np.append(middle, 1.0)
+    shifts = ((D - np.eye(4)) @ at[..., None])[:, :3, 0]
+    frames = chain.before if data.mount == "eye-to-hand" else invert(chain.after)
+    names = [view.id for view in data.views]
+    return find_drift(names, pose_vectors(D)[:, :3], shifts, frames[:, :3, :3])
+
+
+def _pitch(views: Sequence[RobotView]) -> float:
+    """The side of a square or marker, or the spacing of dots, as stated: the smallest distance
+    between points that follow each other, metres."""
+    steps = [np.linalg.norm(np.diff(view.points, axis=0), axis=1) for view in views]
+    return float(np.concatenate(steps).min())
 
 
 def _frames(data: RobotData) -> tuple[str, str]:

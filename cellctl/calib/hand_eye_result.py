@@ -9,6 +9,7 @@ import numpy as np
 
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.chain import ChainState, Sheet
+from cellctl.calib.drift import Drift
 from cellctl.calib.hand_eye_choice import Candidate
 from cellctl.calib.hand_eye_fit import Mount
 from cellctl.calib.views import Rejection, shortage
@@ -38,7 +39,8 @@ class HandEyeResult:
     """`camera_pose` is T_base_camera or T_flange_camera, `board_pose` T_flange_board or
     T_base_board. `covariance` (12, 12) is that of small turns (rad) and shifts (m) of both, each
     in its own child frame. `candidates` are all ways that were tried; `why` says why `chosen`.
-    `scale` and `warp` are those of the board, over its `sheet`: see chain.Sheet.
+    `scale` and `warp` are those of the board, over its `sheet`: see chain.Sheet;
+    `pitch_m` is the side of its squares or markers, or the spacing of its dots, as stated.
     """
 
     mount: Mount
@@ -52,6 +54,7 @@ class HandEyeResult:
     scale: float
     warp: Array
     sheet: Sheet
+    pitch_m: float
     robot_sigma: Array
     axis_scatter_deg: Array
     rms_px: float
@@ -59,6 +62,7 @@ class HandEyeResult:
     held_out_used_px: float
     views: tuple[HandEyeView, ...]
     rejected: tuple[Rejection, ...]
+    drift: Drift | None = None
 
     @property
     def state(self) -> ChainState:
@@ -136,6 +140,8 @@ class HandEyeLimits:
     rejected: float = 1.0 / 3.0
     spread_mm: float = 5.0
     scale: float = 0.01
+    drift_mm: float = 1.0
+    drift_deg: float = 0.1
 
 
 def judge(
@@ -151,6 +157,9 @@ def judge(
             f"three axes; at least {limits.scatter_deg[0]:.0f} and {limits.scatter_deg[1]:.0f} "
             "are needed about the weaker two: add views tilted about other axes"
         )
+    drift = result.drift
+    if drift is not None and (drift.mm > limits.drift_mm or drift.deg > limits.drift_deg):
+        reasons.append(f"{drift}; fix it, let it warm up, and take the views again")
     reasons += _errors(result, limits)
     return ("fail" if reasons else "pass"), tuple(reasons)
 
@@ -171,8 +180,10 @@ def _errors(result: HandEyeResult, limits: HandEyeLimits) -> list[str]:
         )
     if not abs(result.scale - 1.0) <= limits.scale:
         way = "smaller" if result.scale < 1.0 else "larger"
+        stated = 1e3 * result.pitch_m
         reasons.append(
-            f"the board is {100 * abs(result.scale - 1.0):.1f} % {way} than stated, by the "
-            "robot's measure: measure the board"
+            f"the board is {100 * abs(result.scale - 1.0):.1f} % {way} than stated, by the robot's "
+            f"measure: what should be {stated:.2f} mm seems to be {stated * result.scale:.2f} mm; "
+            "measure the board and state that"
         )
     return reasons
