@@ -10,6 +10,7 @@ from typing import Any
 from cellctl.calib import hand_eye, intrinsic
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import usable_views
+from cellctl.calib.charuco import OTHER_PATTERN
 from cellctl.calib.hand_eye_result import HandEyeResult
 from cellctl.calib.intrinsic import IntrinsicLimits, IntrinsicResult
 from cellctl.calib.observe import NOT_FOUND, Observed, observe, observe_with_robot
@@ -57,6 +58,8 @@ def answer(dataset: Dataset) -> Answer:
 
 def _solve_intrinsic(dataset: Dataset) -> Answer:
     seen = observe(dataset.board, dataset.images())
+    if _other_pattern(seen):
+        return Answer(_unsolved(SolveError(OTHER_PATTERN), seen, dataset))
     require_board(seen, dataset, "views")
     try:
         result = _camera_from(seen, dataset, dataset.image_size)
@@ -69,6 +72,8 @@ def _solve_intrinsic(dataset: Dataset) -> Answer:
 def _solve_hand_eye(dataset: Dataset) -> Answer:
     assert dataset.mount is not None
     seen = observe_with_robot(dataset.board, dataset.images_with_robot())
+    if _other_pattern(seen):
+        return Answer(_unsolved(SolveError(OTHER_PATTERN), seen, dataset))
     require_board(seen, dataset, "views")
     doubts: tuple[str, ...] = ()
     camera: CameraModel | None = None
@@ -123,6 +128,12 @@ def _camera_that_came_along(
     return camera, tuple(f"intrinsic_images: {doubt}" for doubt in doubts), {"intrinsic": facts}
 
 
+def _other_pattern(seen: Observed[Any]) -> bool:
+    """Whether no picture shows the board because its `legacy` is stated wrong: its pictures are
+    sound, so that is a verdict on what was stated."""
+    return not seen.sights and any(OTHER_PATTERN in unseen.reason for unseen in seen.unseen)
+
+
 def require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
     """BadInput when no picture shows the board."""
     if seen.sights:
@@ -143,7 +154,8 @@ def _judged(reasons: Sequence[str], solved: dict[str, Any]) -> dict[str, Any]:
 def _unsolved(error: SolveError, seen: Observed[Any], dataset: Dataset) -> dict[str, Any]:
     """No answer, said as every answer is: pictures that are too few or too alike are no misuse."""
     _, few = usable_views(seen.views, dataset.board.minimum_points)
-    rejected = [rejection.to_dict() for rejection in _merged(few, seen.unseen)]
+    told = [Rejection(name, reason) for name, reason in error.details.get("views", {}).items()]
+    rejected = [rejection.to_dict() for rejection in _merged([*few, *told], seen.unseen)]
     return _judged([error.message], {"views": {"used": [], "rejected": rejected}})
 
 

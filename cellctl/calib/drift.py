@@ -17,8 +17,9 @@ LEAST_VIEWS = 6
 SHUFFLES = 400
 """A trend must explain more than the best trend in so many shuffles of the views: always the same
 ones. Errors of a robot that go with its place are smooth, too, but not along the order."""
-SHARE = 0.5
+SHARE = 0.4
 """And at least that part of the disagreements."""
+CLIP = 2.0
 TIE = 1.02
 """A ramp from the first view on is preferred to what explains no more than that factor more."""
 
@@ -87,17 +88,27 @@ def _shapes(n: int) -> tuple[Array, Array]:
     return shapes, np.concatenate([ramp_starts, jump_starts])
 
 
+def _clipped(vectors: Array) -> Array:
+    """(n, 3) in median lengths; what is longer than CLIP is shortened: one bad view is no trend,
+    and hides none."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    limit = CLIP * max(float(np.median(lengths)), 1e-12)
+    return CLIP * vectors / np.maximum(lengths, limit)
+
+
 def _trend(moved: Array, shapes: Array) -> tuple[float, int, Array] | None:
-    """Share that the best shape explains of (n, 6), which shape, and the change (6,) from its
-    first to its last view; None when it may be chance."""
+    """Share that the best shape explains of the turns or of the shifts in (n, 6), which shape, and
+    the change (6,) from its first to its last view; None when it may be chance."""
     off = moved - moved.mean(axis=0)
-    white = off.copy()
-    for part in (slice(0, 3), slice(3, 6)):
-        white[:, part] /= max(float(np.sqrt(np.square(off[:, part]).mean())), 1e-12)
+    parts = np.stack(
+        [_clipped(part - np.median(part, axis=0)) for part in np.split(off, 2, axis=1)]
+    )
+    parts -= parts.mean(axis=1, keepdims=True)
+    parts /= np.sqrt(np.square(parts).sum(axis=(1, 2), keepdims=True)) + 1e-12
     rng = np.random.default_rng(0)
     order = np.array([rng.permutation(len(off)) for _ in range(SHUFFLES)])
-    explained = np.square(shapes @ white).sum(axis=1) / np.square(white).sum()
-    chance = np.square(shapes @ white[order]).sum(axis=2).max(axis=1) / np.square(white).sum()
+    explained = np.square(shapes @ parts).sum(axis=2).max(axis=0)
+    chance = np.square(shapes @ parts[:, order]).sum(axis=3).max(axis=(0, 2))
     best = int(np.argmax(explained))
     if explained[0] * TIE >= explained[best]:
         best = 0

@@ -8,7 +8,7 @@ reprojection errors; the error on views that a solution has not seen decides bet
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,14 +16,12 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import (
     MINIMUM_POINTS,
     MINIMUM_VIEWS,
-    CameraFit,
     require_views,
     usable_views,
 )
 from cellctl.calib.chain import ChainState, Free, Sheet
 from cellctl.calib.closed_form import (
     axis_scatter_deg,
-    consistent_options,
     discrepancies,
     robust_start,
     scaled,
@@ -45,19 +43,17 @@ from cellctl.calib.hand_eye_fit import (
     Noise,
     Option,
     PosePriors,
-    Possible,
     RobotData,
     adjust,
     estimate_noise,
     options,
-    possible_poses,
     predicted,
 )
 from cellctl.calib.hand_eye_result import HandEyeLimits, HandEyeResult, HandEyeView, judge
-from cellctl.calib.intrinsic import best_camera
+from cellctl.calib.hand_eye_sight import Sight, look, oriented
 from cellctl.calib.pose import pose_vectors
 from cellctl.calib.schur import minimise
-from cellctl.calib.views import Rejection, RobotView, noise_px, ordered, rms
+from cellctl.calib.views import Rejection, RobotView, ordered, rms
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, Transform, invert, rotation_angle, transform_points
 
@@ -94,7 +90,7 @@ def solve_hand_eye(
     every = ordered(views)
     usable, rejected = usable_views(every, minimum_points)
     require_views(usable, rejected, NEED)
-    sight = _sight(usable, camera, image_size, minimum_points)
+    sight = look(usable, camera, image_size, minimum_points)
     rejected = [*rejected, *sight.lost]
     require_views(sight.views, rejected, NEED)
     job, gross, factor = _job(sight, mount, priors)
@@ -106,39 +102,10 @@ def solve_hand_eye(
     return replace(result, rejected=tuple(rejected))
 
 
-@dataclass(frozen=True, eq=False)
-class _Sight:
-    """What pictures alone say: the camera (and its fit, if it comes from them), what each allows
-    by its id, the views without a pose, and the bend of the board."""
-
-    camera: CameraModel
-    fit: CameraFit | None
-    found: dict[str, Possible]
-    lost: list[Rejection]
-    warp: Array
-
-    @property
-    def views(self) -> list[RobotView]:
-        return [possible[0][0] for possible in self.found.values()]
-
-
-def _sight(
-    views: list[RobotView],
-    camera: CameraModel | None,
-    image_size: tuple[int, int] | None,
-    minimum_points: int,
-) -> _Sight:
-    if camera is not None:
-        return _Sight(camera, None, *possible_poses(views, camera), np.zeros(3))
-    fit, rejected = _camera_of(views, image_size, minimum_points)
-    fit, found, lost = located(views, fit)
-    return _Sight(fit.camera, fit, found, [*rejected, *lost], fit.state.warp)
-
-
-def _job(sight: _Sight, mount: Mount, priors: PosePriors) -> tuple[Job, list[Rejection], float]:
+def _job(sight: Sight, mount: Mount, priors: PosePriors) -> tuple[Job, list[Rejection], float]:
     """Orientation of the board, start; gross errors out; and the factor by which the board was
     enlarged because it is another one than stated."""
-    views, boards, noise = _oriented(list(sight.found.values()), mount, sight.camera)
+    views, boards, noise = oriented(list(sight.found.values()), mount, sight.camera)
     data = RobotData.of(views, mount)
     start = scaled_start(data.reported, boards)
     require_sense(Evidence.of(list(sight.found.values()), mount), start)
@@ -155,9 +122,7 @@ def _job(sight: _Sight, mount: Mount, priors: PosePriors) -> tuple[Job, list[Rej
     return estimate_noise(job), gross, factor
 
 
-def _explained(
-    job: Job, sight: _Sight, rejected: list[Rejection], factor: float
-) -> list[Rejection]:
+def _explained(job: Job, sight: Sight, rejected: list[Rejection], factor: float) -> list[Rejection]:
     """With what has happened to views whose robot pose does not fit."""
     if not rejected:
         return []
@@ -176,48 +141,6 @@ def _explained(
     }
     points = factor * np.concatenate([view.points for view in sight.views])
     return explained(chain, rejected, sight.views, possible, np.unique(points, axis=0))
-
-
-def _camera_of(
-    views: list[RobotView], image_size: tuple[int, int] | None, minimum_points: int
-) -> tuple[CameraFit, list[Rejection]]:
-    """A camera from the hand-eye views themselves."""
-    if image_size is None:
-        raise SolveError("a camera or the size of the pictures is needed")
-    best = best_camera(views, image_size, minimum_points=minimum_points)
-    return best.fit, best.rejected
-
-
-def located(
-    views: list[RobotView], fit: CameraFit
-) -> tuple[CameraFit, dict[str, Possible], list[Rejection]]:
-    """What the pictures allow under a camera that came from them. A view that has no pose under
-    it is lost to the camera too, which may cost another view its pose."""
-    lost: list[Rejection] = []
-    while True:
-        used = [view for view in views if view.id in fit.names]
-        found, more = possible_poses(used, fit.camera)
-        lost += more
-        if not more or len(found) < MINIMUM_VIEWS:
-            return fit, found, lost
-        fit = fit.over(np.isin(fit.names, list(found)))
-
-
-def _oriented(
-    found: Sequence[Possible], mount: Mount, camera: CameraModel
-) -> tuple[list[RobotView], Array, float]:
-    """Views with the board turned the same way in all of them, the poses of the board, and the
-    noise of a coordinate of a corner in px."""
-    views = [possible[0][0] for possible in found]
-    poses = [np.stack([pose.matrix for _, pose in possible]) for possible in found]
-    places = consistent_options(RobotData.of(views, mount).reported, poses)
-    chosen = [possible[i] for possible, i in zip(found, places, strict=True)]
-    errors = [
-        camera.project(transform_points(pose.matrix, view.points)) - view.pixels
-        for view, pose in chosen
-    ]
-    boards = np.stack([pose.matrix for _, pose in chosen])
-    return [view for view, _ in chosen], boards, noise_px(np.concatenate(errors))
 
 
 def _without_gross(job: Job) -> tuple[Job, list[Rejection]]:
@@ -326,7 +249,19 @@ def _result(
         views=_views(data, chosen),
         rejected=(),
         drift=_drift(job),
+        turned=_turned(data.views, every, factor),
     )
+
+
+def _turned(
+    used: Sequence[RobotView], every: Sequence[RobotView], factor: float
+) -> tuple[str, ...]:
+    """Views whose board had to be turned against the others'."""
+    given = {view.id: factor * view.points for view in every}
+    turned = {view.id for view in used if not np.allclose(view.points, given[view.id])}
+    if 2 * len(turned) > len(used):
+        turned = {view.id for view in used} - turned
+    return tuple(sorted(turned))
 
 
 def _drift(job: Job) -> Drift | None:

@@ -43,6 +43,7 @@ FITS_M, FITS_RAD, FITS_MEDIANS = 0.005, np.radians(0.5), 5.0
 class Evidence:
     """Flange poses (n, 4, 4) as reported, and the poses of the board that each picture allows."""
 
+    names: list[str]
     flanges: Array
     possible: list[Array]
     mount: Mount
@@ -50,7 +51,10 @@ class Evidence:
     @classmethod
     def of(cls, found: Sequence[Possible], mount: Mount) -> Evidence:
         flanges = np.stack([options[0][0].T_base_flange.matrix for options in found])
-        return cls(flanges, [np.stack([p.matrix for _, p in options]) for options in found], mount)
+        names = [options[0][0].id for options in found]
+        return cls(
+            names, flanges, [np.stack([p.matrix for _, p in options]) for options in found], mount
+        )
 
     def start(self, flanges: Array) -> Consensus | None:
         """How well the pictures would fit other poses; None when those determine nothing."""
@@ -73,12 +77,12 @@ def require_sense(evidence: Evidence, own: Consensus) -> None:
         )
     if not _off(own, DOUBT_M, DOUBT_RAD):
         return
-    for words, flanges in _mistakes(evidence).items():
-        other = evidence.start(flanges)
+    for mistake in _mistakes(evidence):
+        other = evidence.start(mistake.flanges)
         if other is None or _off(other, DOUBT_M, DOUBT_RAD):
             continue
         if _score(other) * BETTER < _score(own):
-            raise SolveError(words)
+            raise SolveError(mistake.words, views=mistake.views)
     if _off(own, HOPELESS_M, HOPELESS_RAD):
         raise SolveError(
             f"pictures and robot poses do not belong together: the median view is off by "
@@ -101,23 +105,50 @@ def _score(start: Consensus) -> float:
     return _shift(start) + LEVER_M * start.angle
 
 
-def _mistakes(evidence: Evidence) -> dict[str, Array]:
-    """What to say, and the poses (n, 4, 4) as they should have been."""
-    F = evidence.flanges
+@dataclass(frozen=True, eq=False)
+class _Mistake:
+    """What to say of it, and of each view by its id; the poses (n, 4, 4) if it is undone."""
+
+    words: str
+    flanges: Array
+    views: dict[str, str]
+
+
+def _mistakes(evidence: Evidence) -> list[_Mistake]:
+    F, stated = evidence.flanges, evidence.mount
     transposed = F.copy()
     transposed[:, :3, :3] = np.swapaxes(F[:, :3, :3], 1, 2)
-    stated = evidence.mount
     other = "eye-in-hand" if stated == "eye-to-hand" else "eye-to-hand"
-    return {
+    forms = {
         f"the views fit if the mount is {other}, not {stated}: state that; or, if the mount is "
         "right, the poses are inverted (T_flange_base): write T_base_flange": invert(F),
-        "the views fit if every pose's rotation is transposed: write T_base_flange with "
-        "p_base = T_base_flange p_flange, row by row": transposed,
-        "every pose belongs to the picture before it, in the order of the ids: the list of poses "
-        "is shifted by one against the pictures; pair them again": np.roll(F, -1, axis=0),
-        "every pose belongs to the picture after it, in the order of the ids: the list of poses "
-        "is shifted by one against the pictures; pair them again": np.roll(F, 1, axis=0),
-        "the poses are in the reverse order of the pictures: pair them again": F[::-1],
+        "the views fit if every pose's rotation is transposed: write T_base_flange row by row, "
+        "p_base = T_base_flange p_flange": transposed,
+    }
+    n = np.arange(len(F))
+    shifted = (
+        "every pose belongs to the picture {} it, in the order of the ids: the list of poses is "
+        "shifted by one against the pictures; pair them again"
+    )
+    orders = {
+        shifted.format("before"): np.roll(n, -1),
+        shifted.format("after"): np.roll(n, 1),
+        "the poses are in the reverse order of the pictures: pair them again": n[::-1],
+    }
+    return [
+        *(_Mistake(words, poses, {}) for words, poses in forms.items()),
+        *(
+            _Mistake(words, F[order], _paired(evidence.names, order))
+            for words, order in orders.items()
+        ),
+    ]
+
+
+def _paired(names: Sequence[str], order: Array) -> dict[str, str]:
+    """Of each view, whose pose its picture fits."""
+    return {
+        name: f"its picture fits the pose of view {names[i]!r}"
+        for name, i in zip(names, order, strict=True)
     }
 
 

@@ -41,6 +41,8 @@ class HandEyeResult:
     in its own child frame. `candidates` are all ways that were tried; `why` says why `chosen`.
     `scale` and `warp` are those of the board, over its `sheet`: see chain.Sheet;
     `pitch_m` is the side of its squares or markers, or the spacing of its dots, as stated.
+    `drift` is a trend in the order of the views; `turned` are the views in which the board was
+    numbered from its other end.
     """
 
     mount: Mount
@@ -63,6 +65,7 @@ class HandEyeResult:
     views: tuple[HandEyeView, ...]
     rejected: tuple[Rejection, ...]
     drift: Drift | None = None
+    turned: tuple[str, ...] = ()
 
     @property
     def state(self) -> ChainState:
@@ -75,6 +78,17 @@ class HandEyeResult:
             float(np.log(self.scale)),
             self.warp,
         )
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was noticed, and is no reason to doubt the result by itself."""
+        remarks = [str(self.drift)] if self.drift else []
+        if self.turned:
+            remarks.append(
+                f"the board looks turned by half a turn in views {', '.join(self.turned)}: a print "
+                "that is its own half turn may be numbered from either end; it was undone"
+            )
+        return remarks
 
     @property
     def summary(self) -> dict[str, float]:
@@ -109,6 +123,7 @@ class HandEyeResult:
             "camera": self.camera.to_dict(),
             camera: self.camera_pose.to_list(),
             board: self.board_pose.to_list(),
+            "remarks": self.remarks,
             "method": self.chosen,
             "why": self.why,
             "candidates": {
@@ -170,13 +185,15 @@ def _errors(result: HandEyeResult, limits: HandEyeLimits) -> list[str]:
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: look for a camera or a board that is loose, and compare the "
+            "poses that the robot reports with where it is"
         )
     spread = result.summary["spread_rms_mm"]
     if not spread <= limits.spread_mm:
         reasons.append(
             f"pictures and robot disagree about the board by {spread:.1f} mm, over the limit of "
-            f"{limits.spread_mm} mm"
+            f"{limits.spread_mm} mm: check that each pose is that of its picture, and that nothing "
+            "is loose"
         )
     if not abs(result.scale - 1.0) <= limits.scale:
         way = "smaller" if result.scale < 1.0 else "larger"

@@ -87,7 +87,7 @@ def judge(
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: check that the pictures are sharp and the board is flat"
         )
     focal_sigma = float(np.max(result.sigma[:2] / result.camera.vector[:2]))
     if not focal_sigma <= limits.focal_sigma:

@@ -143,7 +143,10 @@ def judge(
     reasons = []
     seen = len(result.used) + len(result.rejected)
     if len(result.used) < limits.markers:
-        reasons.append(f"only {len(result.used)} markers on the table; {limits.markers} are needed")
+        reasons.append(
+            f"only {len(result.used)} markers on the table, {limits.markers} are needed: clear the "
+            "table and the beam, and check focus and exposure"
+        )
     if len(result.used) < limits.used * seen:
         reasons.append(
             f"only {len(result.used)} of {seen} markers lie on one plane: clear the table"
@@ -151,12 +154,13 @@ def judge(
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} projector px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: check the projector's focus, and that the table is flat"
         )
     if shift is not None and not shift <= limits.shift_px:
         reasons.append(
             f"the markers moved by {shift:.2f} camera px while calibrating, more than "
-            f"{limits.shift_px} px: camera, projector or table was touched"
+            f"{limits.shift_px} px: camera, projector or table was touched: "
+            "fix them and run again"
         )
     return ("fail" if reasons else "pass"), tuple(reasons)
 

@@ -11,9 +11,10 @@ import pytest
 
 from cellctl.calib.camera_fit import CameraOption, fit_camera
 from cellctl.calib.closed_form import METHODS, axis_scatter_deg, closed_form, robust_start
-from cellctl.calib.hand_eye import HandEyeLimits, judge, located, solve_hand_eye
+from cellctl.calib.hand_eye import HandEyeLimits, judge, solve_hand_eye
 from cellctl.calib.hand_eye_estimate import estimate
 from cellctl.calib.hand_eye_fit import options
+from cellctl.calib.hand_eye_sight import located
 from cellctl.calib.intrinsic import solve_intrinsic
 from cellctl.calib.targets import Chessboard
 from cellctl.calib.views import RobotView
