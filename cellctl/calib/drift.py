@@ -14,9 +14,10 @@ import numpy as np
 from cellctl.geometry import Array
 
 LEAST_VIEWS = 6
-SHUFFLES = 400
-"""A trend must explain more than the best trend in so many shuffles of the views: always the same
-ones. Errors of a robot that go with its place are smooth, too, but not along the order."""
+SHUFFLES, CERTAIN = 400, 0.99
+"""A trend must explain more than the best trend does in that part of so many shuffles of the
+views, always the same ones. Errors that go with the robot's place are smooth, too,
+but not along the order."""
 SHARE = 0.4
 """And at least that part of the disagreements."""
 CLIP = 2.0
@@ -39,8 +40,8 @@ class Drift:
         if self.jump:
             return f"from view {self.since!r} on the board is off by {size}: something slipped"
         return (
-            f"in the order of the views the board drifts by {size}, from view {self.since!r} on: "
-            "camera, robot or a mount was warming up or creeping"
+            f"in the order of the views the board drifts by {size}, from about view "
+            f"{self.since!r} on: camera, robot or a mount was warming up or creeping"
         )
 
 
@@ -107,12 +108,11 @@ def _trend(moved: Array, shapes: Array) -> tuple[float, int, Array] | None:
     parts /= np.sqrt(np.square(parts).sum(axis=(1, 2), keepdims=True)) + 1e-12
     rng = np.random.default_rng(0)
     order = np.array([rng.permutation(len(off)) for _ in range(SHUFFLES)])
-    explained = np.square(shapes @ parts).sum(axis=2).max(axis=0)
+    explained = np.square(shapes @ parts).sum(axis=2)
     chance = np.square(shapes @ parts[:, order]).sum(axis=3).max(axis=(0, 2))
-    best = int(np.argmax(explained))
-    if explained[0] * TIE >= explained[best]:
-        best = 0
-    if explained[best] < max(SHARE, float(chance.max())):
+    if explained.max() < max(SHARE, float(np.quantile(chance, CERTAIN))):
         return None
+    share = explained[: len(raw)].max(axis=0)
+    best = 0 if share[0] * TIE >= share.max() else int(np.argmax(share))
     shape = shapes[best]
-    return float(explained[best]), best, (shape @ off) * float(np.ptp(shape))
+    return float(share[best]), best, (shape @ off) * float(np.ptp(shape))

@@ -54,8 +54,8 @@ def shortage(used: int, rejected: int, least: int, share: float) -> list[str]:
         reasons.append(f"only {used} views could be used; at least {least} are needed: add views")
     if rejected > share * (used + rejected):
         reasons.append(
-            f"{rejected} of {used + rejected} views were rejected: see why, view by "
-            "view, and take them again"
+            f"{rejected} of {used + rejected} views were rejected: see why, view by view, "
+            "and take them again"
         )
     return reasons
 
