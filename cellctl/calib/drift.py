@@ -101,9 +101,8 @@ def _trend(moved: Array, shapes: Array) -> tuple[float, int, Array] | None:
     """Share that the best shape explains of the turns or of the shifts in (n, 6), which shape, and
     the change (6,) from its first to its last view; None when it may be chance."""
     off = moved - moved.mean(axis=0)
-    parts = np.stack(
-        [_clipped(part - np.median(part, axis=0)) for part in np.split(off, 2, axis=1)]
-    )
+    raw = np.split(off, 2, axis=1)
+    parts = np.stack([*raw, *(_clipped(part - np.median(part, axis=0)) for part in raw)])
     parts -= parts.mean(axis=1, keepdims=True)
     parts /= np.sqrt(np.square(parts).sum(axis=(1, 2), keepdims=True)) + 1e-12
     rng = np.random.default_rng(0)
