@@ -25,7 +25,9 @@ from cellctl.geometry import Transform, as_transform
 FORMAT = "cellctl-dataset/1"
 FILE = "dataset.json"
 KINDS = ("intrinsic", "hand-eye")
-LATER_KINDS = ("projector-graycode", "markers")
+LATER_KINDS = ("markers",)
+PROJECTOR_KIND = "projector-graycode"
+"""Read by cellctl.projector_data."""
 
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 """Cameras write how they were held; a calibration is that of the sensor."""
@@ -106,12 +108,12 @@ def load_dataset(folder: Path) -> Dataset:
     BadInput names the file, the view and the key, and says what is wrong.
     """
     path = folder / FILE
-    document = _document(path)
+    document = read_document(path)
     _check_kind(document, path)
     try:
         content = _File.model_validate(document)
     except ValidationError as error:
-        raise BadInput(f"{path}: {_explain(error, document)}") from None
+        raise BadInput(f"{path}: {explain(error, document)}") from None
     with_robot = document["kind"] == "hand-eye"
     if with_robot and content.mount is None:
         raise BadInput(f"{path}: a hand-eye data set needs mount: eye-to-hand or eye-in-hand")
@@ -145,7 +147,8 @@ def read_picture(path: Path, size: tuple[int, int], where: str) -> NDArray[np.ui
     return np.asarray(image, dtype=np.uint8)
 
 
-def _document(path: Path) -> dict[str, Any]:
+def read_document(path: Path) -> dict[str, Any]:
+    """A data set's JSON object, of this format. BadInput says what is wrong with it."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -156,12 +159,12 @@ def _document(path: Path) -> dict[str, Any]:
         raise BadInput(f"{path}: not valid JSON: {error}") from None
     if not isinstance(document, dict):
         raise BadInput(f"{path}: must be a JSON object, not {type(document).__name__}")
+    if document.get("format") != FORMAT:
+        raise BadInput(f"{path}: the format must be {FORMAT!r}, not {document.get('format')!r}")
     return document
 
 
 def _check_kind(document: dict[str, Any], path: Path) -> None:
-    if document.get("format") != FORMAT:
-        raise BadInput(f"{path}: the format must be {FORMAT!r}, not {document.get('format')!r}")
     kind = document.get("kind")
     if kind in LATER_KINDS:
         raise BadInput(f"{path}: data sets of kind {kind!r} cannot be solved by this version")
@@ -178,24 +181,26 @@ def _pictures(views: list[_View], path: Path, *, with_robot: bool) -> tuple[Pict
             raise BadInput(f"{where}: this id is used more than once")
         seen.add(view.id)
         pictures.append(
-            Picture(view.id, _image(path, view, where), _flange(view, where, with_robot))
+            Picture(
+                view.id, picture_path(path, view.image, where), _flange(view, where, with_robot)
+            )
         )
     return tuple(sorted(pictures, key=lambda picture: picture.id))
 
 
-def _image(path: Path, view: _View, where: str) -> Path:
-    relative = Path(view.image)
+def picture_path(path: Path, name: str, where: str) -> Path:
+    """The file that a data set at `path` calls `name`. BadInput says `where` it is wanted."""
+    relative = Path(name)
     if relative.is_absolute() or ".." in relative.parts:
         raise BadInput(
-            f"{where}: image must be a path relative to the folder and within it, not "
-            f"{view.image!r}"
+            f"{where}: image must be a path relative to the folder and within it, not {name!r}"
         )
     try:
         exists = (path.parent / relative).is_file()
     except (OSError, ValueError):
         exists = False
     if not exists:
-        raise BadInput(f"{where}: image {view.image!r} does not exist")
+        raise BadInput(f"{where}: image {name!r} does not exist")
     return path.parent / relative
 
 
@@ -211,7 +216,8 @@ def _flange(view: _View, where: str, with_robot: bool) -> Transform | None:
     return pose
 
 
-def _explain(error: ValidationError, document: dict[str, Any]) -> str:
+def explain(error: ValidationError, document: dict[str, Any]) -> str:
+    """What is wrong with a data set, key by key."""
     return "; ".join(_explain_one(item, document) for item in error.errors(include_url=False)[:5])
 
 

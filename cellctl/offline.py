@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cellctl import projector_data
 from cellctl.calib import hand_eye, intrinsic
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import usable_views
@@ -28,6 +29,8 @@ def solve_folder(folder: Path) -> dict[str, Any]:
     """Solve a data set or, again, a recorded run; which of them `folder` is its files tell."""
     if (folder / "run.json").exists():
         return solve_run(folder)
+    if projector_data.is_one(folder):
+        return projector_data.solve(folder)
     return solve_dataset(folder)
 
 

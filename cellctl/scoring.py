@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from cellctl import projector_data
 from cellctl.calib.camera_fit import usable_views
 from cellctl.calib.hand_eye_result import HandEyeResult
 from cellctl.calib.intrinsic import IntrinsicResult
 from cellctl.calib.observe import observe, observe_with_robot
 from cellctl.calib.score import Score, score_camera, score_hand_eye
 from cellctl.calib.views import Rejection
-from cellctl.dataset import Dataset, Picture, load_dataset
+from cellctl.dataset import Dataset, load_dataset
 from cellctl.errors import BadInput
 from cellctl.offline import answer, require_board
 
@@ -29,12 +30,24 @@ def solve_and_score(folder: Path, other: Path) -> dict[str, Any]:
     """Solve the data set in `folder` and score the answer on the one in `other`.
 
     Returns what `cellctl solve --json` prints: the answer's document with `score_px`, over all
-    points of all views, and `score` with `per_view_px`, the views `left_out` and `remarks`.
+    points of all views, and `score` with `per_view_px`, the views `left_out` and `remarks`; of a
+    projector in projector pixels.
     Intrinsic: each view's own pose of the board is fitted, nothing else. Hand-eye: each view is
     predicted through the robot. `score_px` is None when `folder` yields no answer. BadInput when
     the two are not of the same set-up.
     """
-    trained, unseen = _dataset(folder), _dataset(other)
+    for one in (folder, other):
+        if (one / "run.json").exists():
+            raise BadInput(f"{one}: a recorded run; scores need data sets (dataset.json)")
+    projectors = [projector_data.is_one(one) for one in (folder, other)]
+    if all(projectors):
+        return _projector(folder, other)
+    if any(projectors):
+        raise BadInput(
+            f"{other}: cannot score a calibration from {folder}: only one of them is of kind "
+            f"{projector_data.KIND!r}"
+        )
+    trained, unseen = load_dataset(folder), load_dataset(other)
     _require_alike(trained, unseen)
     unseen, seen_before = _without_seen(unseen, trained)
     solved = answer(trained)
@@ -54,10 +67,20 @@ def solve_and_score(folder: Path, other: Path) -> dict[str, Any]:
     }
 
 
-def _dataset(folder: Path) -> Dataset:
-    if (folder / "run.json").exists():
-        raise BadInput(f"{folder}: a recorded run; scores need data sets (dataset.json)")
-    return load_dataset(folder)
+def _projector(folder: Path, other: Path) -> dict[str, Any]:
+    """In projector pixels, the boards' poses being fitted to the camera's corners alone."""
+    known = {_digest(path) for _, files in projector_data.load(folder).captures for path in files}
+    for name, files in projector_data.load(other).captures:
+        if any(_digest(path) in known for path in files):
+            raise BadInput(
+                f"{other}: pictures of capture {name!r} are in {folder} too: leave it out there or "
+                "here; a score needs captures that the calibration has not seen"
+            )
+    solved = projector_data.solve(folder)
+    if "projector" not in solved:
+        return {**solved, "score_px": None}
+    px = projector_data.score(solved, other)
+    return {**solved, "score_px": px, "score": {"data_set": str(other)}}
 
 
 def _require_alike(trained: Dataset, unseen: Dataset) -> None:
@@ -81,8 +104,8 @@ def _size(dataset: Dataset) -> str:
 
 def _without_seen(unseen: Dataset, trained: Dataset) -> tuple[Dataset, list[Rejection]]:
     """Without pictures that the calibration rests on; BadInput when there are no others."""
-    known = {_digest(p) for p in (*trained.pictures, *trained.intrinsic_pictures)}
-    seen = {picture.id for picture in unseen.pictures if _digest(picture) in known}
+    known = {_digest(p.path) for p in (*trained.pictures, *trained.intrinsic_pictures)}
+    seen = {picture.id for picture in unseen.pictures if _digest(picture.path) in known}
     new = tuple(picture for picture in unseen.pictures if picture.id not in seen)
     if not new:
         raise BadInput(
@@ -92,11 +115,11 @@ def _without_seen(unseen: Dataset, trained: Dataset) -> tuple[Dataset, list[Reje
     return replace(unseen, pictures=new), [Rejection(name, SEEN) for name in seen]
 
 
-def _digest(picture: Picture) -> bytes:
+def _digest(path: Path) -> bytes:
     try:
-        return hashlib.sha256(picture.path.read_bytes()).digest()
+        return hashlib.sha256(path.read_bytes()).digest()
     except OSError as error:
-        raise BadInput(f"{picture.path}: cannot be read: {error}") from None
+        raise BadInput(f"{path}: cannot be read: {error}") from None
 
 
 def _score(

@@ -159,6 +159,8 @@ def undistort(target: Array, coefficients: Array) -> Array:
     A few fixed-point steps stay on the branch through the centre, Newton's finish the work.
     """
     xy = np.array(target, dtype=float)
+    if not np.any(coefficients):
+        return xy
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for _ in range(6):
             xy += target - distort(xy, coefficients)

@@ -113,7 +113,7 @@ def fit_camera(
     usable, rejected = usable_views(views, minimum_points)
     while True:
         require_views(usable, rejected, NEED)
-        camera, poses = _start(usable, image_size)
+        camera, poses = start_camera(usable, image_size)
         bad = {view.id: NO_POSE for view in usable if view.id not in poses}
         if not bad:
             fit = _fit(usable, camera, np.stack([poses[view.id] for view in usable]), option)
@@ -160,7 +160,7 @@ def _fit(
     return CameraFit(tuple(view.id for view in views), chain, solution)
 
 
-def _start(
+def start_camera(
     views: Sequence[View], image_size: tuple[int, int]
 ) -> tuple[CameraModel, dict[str, Array]]:
     """A pinhole, and T_camera_board by the ids of the views that it explains.
@@ -170,15 +170,41 @@ def _start(
     """
     guesses = _zhang(views, image_size) + [factor * max(image_size) for factor in FOCAL_GUESSES]
     cameras = [_pinhole(focal, image_size) for focal in guesses]
-    found = [{view.id: pose for view in views if (pose := _rough(view, c))} for c in cameras]
-    errors = [
-        float(np.median([poses[v.id].rms_px if v.id in poses else np.inf for v in views]))
-        for poses in found
-    ]
+    batch, maps = Batch.of(views), _homographies(views)
+    errors = [float(np.median(_by_homography(batch, maps, camera))) for camera in cameras]
     best = int(np.argmin(errors))
     if not np.isfinite(errors[best]):
         raise SolveError("no pinhole camera explains the views of the board, not even roughly")
-    return cameras[best], {name: pose.matrix for name, pose in found[best].items()}
+    found = {view.id: pose for view in views if (pose := _rough(view, cameras[best]))}
+    return cameras[best], {name: pose.matrix for name, pose in found.items()}
+
+
+def _homographies(views: Sequence[View]) -> Array:
+    """(n, 3, 3) from the board's plane to the picture; not-a-number where there is none."""
+    maps = np.full((len(views), 3, 3), np.nan)
+    for i, view in enumerate(views):
+        middle, spread = view.points[:, :2].mean(axis=0), np.ptp(view.points[:, :2])
+        scaled = (view.points[:, :2] - middle) / spread  # OpenCV works in single precision
+        found, _ = cv2.findHomography(scaled, view.pixels)
+        if found is not None:
+            maps[i] = found @ np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]])
+    return maps
+
+
+def _by_homography(batch: Batch, maps: Array, camera: CameraModel) -> Array:
+    """Reprojection errors (n,), rms px, of the poses that homographies (n, 3, 3) contain for a
+    pinhole camera, infinite where there is none: Z. Zhang, 2000, section 3.1 and appendix C."""
+    rays = np.linalg.inv(camera.K) @ maps
+    lengths = np.linalg.norm(rays[:, :, :2], axis=1).mean(axis=1)
+    rays = rays / (lengths * np.sign(rays[:, 2, 2]))[:, None, None]
+    known = np.isfinite(rays).all(axis=(1, 2))
+    rays[~known] = np.eye(3)
+    across = np.cross(rays[:, :, 0], rays[:, :, 1])
+    u, _, vt = np.linalg.svd(np.stack([rays[:, :, 0], rays[:, :, 1], across], axis=-1))
+    points = batch.points @ np.swapaxes(u @ vt, 1, 2) + rays[:, None, :, 2]
+    off = np.where(batch.seen[..., None], camera.project(points) - batch.pixels, 0.0)
+    errors = np.sqrt(np.square(off).sum(axis=(1, 2)) / batch.seen.sum(axis=1))
+    return np.where(known & np.isfinite(errors), errors, np.inf)
 
 
 def _rough(view: View, camera: CameraModel) -> BoardPose | None:

@@ -50,6 +50,15 @@ def cross_matrices(vectors: Array) -> Array:
     return matrices
 
 
+def adjoint(matrix: Array) -> Array:
+    """(6, 6) of a pose (4, 4) T: T pose(d) T^-1 = pose(adjoint @ d), to first order in d."""
+    R, t = matrix[:3, :3], matrix[:3, 3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[3:, :3] = cross_matrices(t[None])[0] @ R
+    return result
+
+
 def derivatives_by_pose(by_point: Array, points: Array) -> Array:
     """(..., 2, 6): derivatives by d when the pose T that maps `points` (..., 3) becomes
     T @ pose(d), d a rotation vector and a translation, from the derivatives (..., 2, 3) by the

@@ -198,11 +198,11 @@ def _sightings(
         raise SolveError("the camera's distortion has no inverse where markers were seen")
     fold = np.array([fold for _, fold, _ in found])
     if len(np.unique(fold)) == 1:
-        fold = _blocks(pixels)
+        fold = blocks(pixels)
     return _Sightings(ids, pixels, xy, fold)
 
 
-def _blocks(pixels: Array) -> Array:
+def blocks(pixels: Array) -> Array:
     """Number (n,) of the block that each of pixels (n, 2) lies in: BLOCKS x BLOCKS."""
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     cell = np.minimum((pixels - low) / np.maximum(high - low, 1e-9) * BLOCKS, BLOCKS - 1)
@@ -270,7 +270,7 @@ def _fit(
     if start is None:
         H = direct_linear_transform(seen.xy, seen.pixels)
         start = _with_lens(H, lens)
-    return minimise(_MapProblem(seen, lens), start, huber=HUBER_PX).state
+    return minimise(MapProblem(seen.xy, seen.pixels, lens), start, huber=HUBER_PX).state
 
 
 def _with_lens(H: Array, lens: LensPrior | None) -> ProjectorMap:
@@ -280,25 +280,35 @@ def _with_lens(H: Array, lens: LensPrior | None) -> ProjectorMap:
 
 
 @dataclass(frozen=True, eq=False)
-class _MapProblem:
-    """A least-squares problem (schur.Problem) without local unknowns. Globals: H's first eight
-    entries and, with a lens, k1, k2 and the centre in standard deviations of its prior."""
+class MapProblem:
+    """A least-squares problem (schur.Problem) without local unknowns: normalised camera
+    coordinates `xy` (n, 2), the projector's `pixels` (n, 2), and what each coordinate of them
+    counts, `weights` (n, 2), else 1. Globals: H's first eight entries and, with a lens, k1, k2
+    and the centre in standard deviations of its prior."""
 
-    seen: _Sightings
+    xy: Array
+    pixels: Array
     lens: LensPrior | None
+    weights: Array | None = None
+
+    def _weighted(self, pixels: Array) -> Array:
+        off = pixels - self.pixels
+        return (off if self.weights is None else off * self.weights)[None]
 
     def residuals(self, state: ProjectorMap) -> Array:
-        return (state.project(self.seen.xy) - self.seen.pixels)[None]
+        return self._weighted(state.project(self.xy))
 
     def linearise(self, state: ProjectorMap) -> Linearised:
-        ideal, by_H = homography_jacobian(state.H, self.seen.xy)
+        ideal, by_H = homography_jacobian(state.H, self.xy)
         columns = [by_H]
         pixels = ideal
         if self.lens is not None:
             pixels, by_ideal, by_radial, by_centre = state.lens_jacobians(ideal)
             columns = [by_ideal @ by_H, by_radial, by_centre * self.lens.sigma_px]
         jacobian = np.concatenate(columns, axis=-1)[None]
-        return Linearised((pixels - self.seen.pixels)[None], jacobian, jacobian[..., :0])
+        if self.weights is not None:
+            jacobian = jacobian * self.weights[None, ..., None]
+        return Linearised(self._weighted(pixels), jacobian, jacobian[..., :0])
 
     def priors(self, state: ProjectorMap) -> Priors:
         on_locals, by_locals = np.zeros((1, 0)), np.zeros((1, 0, 0))

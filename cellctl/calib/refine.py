@@ -9,6 +9,8 @@ import numpy as np
 
 from cellctl.calib.adjust import joint_family
 from cellctl.calib.calibration import Calibration
+from cellctl.calib.challenger import NAME as CHALLENGER
+from cellctl.calib.challenger import challenger_family
 from cellctl.calib.refine_fit import (
     FAMILIES,
     LARGEST_CONDITION,
@@ -27,8 +29,8 @@ from cellctl.errors import SolveError
 from cellctl.geometry import Array, Mask
 
 MINIMUM_MARKS = 4
-JOINT_PLACE = 3
-"""Among the families in order of preference: after the similarity."""
+JOINT_AFTER, CHALLENGER_AFTER = "similarity", "projective"
+"""Where these stand among the families, which go from the simplest on."""
 BANDS = 5
 """In which the marks' x, and their y, are cut: rows of a grid of up to five stay whole."""
 UNDETERMINED = 1e3
@@ -49,11 +51,11 @@ def solve_refine(
     best, and the pen's offset.
 
     Each family is judged by the worse of two held-out errors, everything being fitted again:
-    without one circle, and without one row or column of them. The first that cannot be told from
-    the best is taken. Circles that contradict the others are left out of every fit and still get
-    a held-out error. `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult,
-    allows the joint adjustment. `families`: only these are tried. SolveError when fewer than 4
-    circles agree; BadInput as `Marks.of`.
+    without one circle, and without one row or column of them; see `choose`. Circles that
+    contradict the others are left out of every fit and still get a held-out error.
+    `pose_covariance` (6, 6), that of base's T_world_camera as in HandEyeResult, allows the joint
+    adjustment. `families`: only these are tried. SolveError when fewer than 4 circles agree;
+    BadInput as `Marks.of`.
     """
     base = replace(base, refinement=None)
     marks = sorted(marks, key=lambda mark: mark.key)
@@ -62,10 +64,7 @@ def solve_refine(
         raise SolveError(f"only {len(drawn)} circles were measured, {MINIMUM_MARKS} are needed")
     frame = Frame.of(drawn)
     used = _consensus(drawn, frame)
-    known = list(FAMILIES)
-    if pose_covariance is not None:
-        joint = joint_family(base, pose_covariance, drawn, frame)
-        known.insert(JOINT_PLACE, joint)
+    known = _families(drawn, used, frame, base, pose_covariance)
     wanted = [f for f in known if families is None or f.name in families]
     tried = [_candidate(family, drawn, used, frame, base) for family in wanted]
     chosen, why = choose([c for c in tried if c.fit is not None])
@@ -94,9 +93,45 @@ def solve_refine(
     )
 
 
+def _families(
+    marks: Marks, used: Mask, frame: Frame, base: Calibration, pose_covariance: Array | None
+) -> list[Family]:
+    """All of them, from the simplest on."""
+    more = {CHALLENGER_AFTER: challenger_family(marks[used], frame)}
+    if pose_covariance is not None:
+        more[JOINT_AFTER] = joint_family(base, pose_covariance, marks, frame)
+    known = []
+    for family in FAMILIES:
+        known += [family, more[family.name]] if family.name in more else [family]
+    return known
+
+
 def choose(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
-    """The candidate to trust and why. They come from the simplest on; the first that the data
-    cannot tell from the best one wins, see `views.excess`."""
+    """The candidate to trust and why, in words.
+
+    The others come from the simplest on, and the first that the data cannot tell from the best one
+    stands for them, see `views.excess`. The challenger is taken unless that one predicts circles
+    left out one by one better, by more than chance does: it takes nothing on trust but the
+    circles, and since its field is no larger than they ask for, it needs no row of them left out to
+    keep it from bending between rows.
+    """
+    others = [c for c in candidates if c.name != CHALLENGER]
+    challenger = next((c for c in candidates if c.name == CHALLENGER), None)
+    if challenger is None:
+        return _simplest(others)
+    if not others:
+        return challenger, "nothing else was tried"
+    other, why = _simplest(others)
+    one, two = (c.errors["leave_one_out"].mm for c in (challenger, other))
+    if excess(challenger.left_one_out_mm, other.left_one_out_mm) > 0.0:
+        return other, f"{why}; the circles alone, without hand-eye, reach {one:.3f} mm"
+    return challenger, (
+        f"held-out error {one:.3f} mm by the circles alone, without hand-eye; {other.name}, which "
+        f"stands for the corrections of hand-eye's chain, reaches {two:.3f} mm"
+    )
+
+
+def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
     best = min(candidates, key=lambda c: c.worse_mm)
     chosen = next(c for c in candidates if excess(c.held_out_mm, best.held_out_mm) <= 0.0)
     if chosen is best:

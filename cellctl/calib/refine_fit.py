@@ -44,7 +44,8 @@ class Mark:
 class Family:
     """`entries` (8, p): how the parameters move H's first eight entries about the identity.
     `monomials` counts those of higher degree. Allowed from `least` marks. `known`: the parameters
-    are in standard deviations of what was known of them before."""
+    are in standard deviations of what was known of them before. `field_mm`: the prior standard
+    deviation of a monomial's coefficient, millimetres on the table; infinite: there is no prior."""
 
     name: str
     least: int
@@ -52,6 +53,7 @@ class Family:
     monomials: int = 0
     kernel: str = "none"
     known: bool = False
+    field_mm: float = np.inf
 
 
 def _entries(*columns: dict[int, float]) -> Array:
@@ -226,7 +228,7 @@ def held_out_fits(
         return
     parameters = _Parameters(family, frame, None)
     values = parameters.values(found)
-    A, r = _linearise(parameters, values, found.tcp, marks, np.ones(len(marks)))
+    A, r = design(family, marks, frame, found)
     penalty, pull = parameters.penalty(values, found.tcp)
     for number in numbers:
         kept = np.repeat(fold != number, 2)
@@ -236,6 +238,14 @@ def held_out_fits(
         yield number, Fit(refinement, tcp, normal, penalty, int(kept.sum()) // 2)
 
 
+def design(family: Family, marks: Marks, frame: Frame, found: Fit) -> tuple[Array, Array]:
+    """Derivatives (2n, p + 2) and errors (2n,), millimetres on the table, of the marks about a fit:
+    by the family's values, and last by the pen's offset in mm."""
+    parameters = _Parameters(family, frame, None)
+    values = parameters.values(found)
+    return _linearise(parameters, values, found.tcp, marks, np.ones(len(marks)))
+
+
 def condition(family: Family, marks: Marks, frame: Frame) -> float:
     """Condition number of the family's columns over the marks, each scaled to the length 1.
 
@@ -243,7 +253,8 @@ def condition(family: Family, marks: Marks, frame: Frame) -> float:
     cannot tell, for what is left out lies where it vanishes too.
     """
     start = Refinement(family.name, frame.centre, frame.scale)
-    columns = _Parameters(family, frame, None).basis(start, start.scaled(marks.chain(np.zeros(2))))
+    free = replace(family, monomials=0) if np.isfinite(family.field_mm) else family
+    columns = _Parameters(free, frame, None).basis(start, start.scaled(marks.chain(np.zeros(2))))
     columns = columns.reshape(2 * len(marks), -1)
     if columns.shape[1] == 0 or family.known:
         return 1.0  # nothing to determine, or determined before
@@ -315,6 +326,8 @@ class _Parameters:
         diagonal = np.zeros(len(values) + 2)
         if self.smooth is not None:
             diagonal[-2 - self._of_kernel : -2] = self.smooth.ridge * self.frame.mm**2
+        of_H, count = self.family.entries.shape[1], 2 * self.family.monomials
+        diagonal[of_H : of_H + count] = (MARK_SIGMA_MM * self.frame.mm / self.family.field_mm) ** 2
         if self.family.known:
             diagonal[: self.family.entries.shape[1]] = MARK_SIGMA_MM**2
         diagonal[-2:] = (MARK_SIGMA_MM / TCP_PRIOR_MM) ** 2

@@ -31,8 +31,8 @@ class Candidate:
     """How one family does. `refused` says why it was not tried, else it is empty.
 
     `errors` by name: "training"; "leave_one_out", "leave_row_out" of the circles used; and the
-    same two with those rejected, "..._all". `held_out_mm` (n, 2) are the errors of the circles
-    used in the worse of the two ways.
+    same two with those rejected, "..._all". `held_out_mm` (n, ways, 2) are the errors of the
+    circles used in the worse of the two ways, `left_one_out_mm` those in the first.
     """
 
     name: str
@@ -41,6 +41,7 @@ class Candidate:
     fit: Fit | None = None
     errors: Mapping[str, Errors] = field(default_factory=dict)
     held_out_mm: Any = ()
+    left_one_out_mm: Any = ()
 
     @property
     def worse_mm(self) -> float:
@@ -69,7 +70,8 @@ class Candidate:
             "leave_row_out_all": _errors(row, np.ones_like(used)),
         }
         worse = max((one, row), key=lambda both: _errors(both, used).mm)
-        return cls(name, condition, "", fit, errors, _by_circle(worse[1][used]))
+        apart = _by_circle(worse[1][used]), _by_circle(one[1][used])
+        return cls(name, condition, "", fit, errors, *apart)
 
     def to_dict(self) -> dict[str, Any]:
         return {

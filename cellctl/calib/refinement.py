@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cellctl.calib.projector_map import apply_homography
+from cellctl.calib.homography import apply_homography
 from cellctl.errors import BadInput
 from cellctl.geometry import Array
 
@@ -18,6 +18,7 @@ FAMILIES = (
     "joint",
     "affine",
     "projective",
+    "challenger",
     "quadratic",
     "rbf",
     "thin-plate",

@@ -8,11 +8,13 @@ loss by reweighting. Triggs et al., Bundle adjustment: a modern synthesis, 2000,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from cellctl.errors import SolveError
 from cellctl.geometry import Array
@@ -28,13 +30,43 @@ NEGLIGIBLE = 1e-12
 class Linearised:
     """Observations of n views at a state, in units of their standard deviation.
 
-    `residuals` (n, k, 2), zero where nothing was seen; their derivatives `by_globals`
-    (n, k, 2, g) and `by_locals` (n, k, 2, l).
+    `residuals` (n, k, d), zero where nothing was seen; their derivatives `by_globals`
+    (n, k, d, g) and `by_locals` (n, k, d, l). A residual of d numbers is weighted as one.
+
+    A part of a larger problem has derivatives by its own `columns` of the globals only, and by
+    the blocks of its own `views`, as many as n; or by none, and is one "view" (n = 1, l = 0).
     """
 
     residuals: Array
     by_globals: Array
     by_locals: Array
+    columns: Array | slice = field(default_factory=lambda: slice(None))
+    views: slice = field(default_factory=lambda: slice(None))
+
+    def weighted(self, huber: float) -> Linearised:
+        """With the square roots of Huber's weights multiplied in."""
+        if not np.isfinite(huber):
+            return self
+        lengths = np.linalg.norm(self.residuals, axis=-1)
+        if lengths.max(initial=0.0) <= huber:
+            return self
+        scale = np.sqrt(huber / np.maximum(lengths, huber))[..., None]
+        return replace(
+            self,
+            residuals=self.residuals * scale,
+            by_globals=self.by_globals * scale[..., None],
+            by_locals=self.by_locals * scale[..., None],
+        )
+
+    @property
+    def rows(self) -> tuple[Array, Array, Array]:
+        """Residuals (n, k d, 1) and derivatives (n, k d, g), (n, k d, l), view by view."""
+        n, k, d = self.residuals.shape
+        return (
+            self.residuals.reshape(n, k * d, 1),
+            self.by_globals.reshape(n, k * d, self.by_globals.shape[-1]),
+            self.by_locals.reshape(n, k * d, self.by_locals.shape[-1]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +83,9 @@ class Priors:
 class Problem(Protocol[State]):
     """What `minimise` needs to know. A state is never changed, `retract` makes the next one."""
 
-    def linearise(self, state: State) -> Linearised: ...
+    def linearise(self, state: State) -> Linearised | Sequence[Linearised]: ...
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: State) -> Array | Sequence[Array]:
         """As in `Linearised`; not-a-number where the state cannot explain an observation."""
         ...
 
@@ -86,13 +118,18 @@ class Solution(Generic[State]):
         return self._covariances[1]
 
     @cached_property
+    def normal(self) -> Normal:
+        """The normal equations at the end."""
+        return _normal(self.problem, self.state, self.huber)
+
+    @cached_property
     def _covariances(self) -> tuple[Array, Array]:
-        return _covariance(_normal(self.problem, self.state, self.huber))
+        return _covariance(self.normal)
 
 
 @dataclass(frozen=True, eq=False)
-class _Normal:
-    """Normal equations: A (g, g), B (n, g, l), C (n, l, l); gradients a (g,), b (n, l)."""
+class Normal:
+    """The normal equations: A (g, g), B (n, g, l), C (n, l, l); gradients a (g,), b (n, l)."""
 
     A: Array
     B: Array
@@ -135,62 +172,91 @@ def minimise(
 
 
 def _cost(problem: Problem[State], state: State, huber: float) -> float:
-    squares = np.square(problem.residuals(state)).sum(axis=-1)
-    if not np.isfinite(squares).all():
-        return np.inf
+    found = problem.residuals(state)
+    parts = [found] if isinstance(found, np.ndarray) else found
     priors = problem.priors(state)
-    loss = squares
-    if np.isfinite(huber):
-        loss = np.where(squares <= huber**2, squares, 2.0 * huber * np.sqrt(squares) - huber**2)
-    prior_loss = np.square(priors.on_globals).sum() + np.square(priors.on_locals).sum()
-    return 0.5 * float(loss.sum() + prior_loss)
+    total = float(np.square(priors.on_globals).sum() + np.square(priors.on_locals).sum())
+    for part in parts:
+        squares = np.square(part).sum(axis=-1)
+        if np.isfinite(huber) and squares.max(initial=0.0) > huber**2:
+            far = 2.0 * huber * np.sqrt(squares) - huber**2
+            squares = np.where(squares <= huber**2, squares, far)
+        total += float(squares.sum())
+    return 0.5 * total if np.isfinite(total) else np.inf
 
 
-def _normal(problem: Problem[State], state: State, huber: float) -> _Normal:
+def _normal(problem: Problem[State], state: State, huber: float) -> Normal:
     seen, priors = problem.linearise(state), problem.priors(state)
-    lengths = np.linalg.norm(seen.residuals, axis=-1)
-    weights = np.sqrt(huber / np.maximum(lengths, huber)) if np.isfinite(huber) else 1.0
-    scale = np.broadcast_to(weights, lengths.shape)[..., None]
-    n = len(lengths)
-    r = (seen.residuals * scale).reshape(n, -1, 1)
-    G = (seen.by_globals * scale[..., None]).reshape(n, r.shape[1], -1)
-    L = (seen.by_locals * scale[..., None]).reshape(n, r.shape[1], -1)
-    Gt, Lt = np.swapaxes(G, 1, 2), np.swapaxes(L, 1, 2)
     Pg, Pl = priors.globals_jacobian, priors.locals_jacobian
     Plt = np.swapaxes(Pl, 1, 2)
-    return _Normal(
-        A=(Gt @ G).sum(axis=0) + Pg.T @ Pg,
-        B=Gt @ L,
-        C=Lt @ L + Plt @ Pl,
-        a=(Gt @ r).sum(axis=0)[:, 0] + Pg.T @ priors.on_globals,
-        b=(Lt @ r + Plt @ priors.on_locals[..., None])[..., 0],
+    normal = Normal(
+        A=Pg.T @ Pg,
+        B=np.zeros((len(Pl), Pg.shape[1], Pl.shape[2])),
+        C=Plt @ Pl,
+        a=Pg.T @ priors.on_globals,
+        b=(Plt @ priors.on_locals[..., None])[..., 0],
     )
+    for part in (seen,) if isinstance(seen, Linearised) else seen:
+        _add(normal, part.weighted(huber))
+    return normal
 
 
-def _step(normal: _Normal, damping: float) -> tuple[Array, Array]:
+def _add(normal: Normal, part: Linearised) -> None:
+    r, G, L = part.rows
+    columns, views = part.columns, part.views
+    # one product of matrices, not one a view; there may be no globals
+    tall = G.reshape(G.shape[0] * G.shape[1], G.shape[-1])
+    square = (columns, columns) if isinstance(columns, slice) else np.ix_(columns, columns)
+    normal.A[square] += tall.T @ tall
+    normal.a[columns] += tall.T @ r.reshape(-1)
+    if L.shape[-1]:
+        Lt = np.swapaxes(L, 1, 2)
+        normal.B[views, columns] += np.swapaxes(G, 1, 2) @ L
+        normal.C[views] += Lt @ L
+        normal.b[views] += (Lt @ r)[..., 0]
+
+
+def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
     """The damped Gauss-Newton step (g,), (n, l)."""
     A = normal.A + np.diag(damping * normal.A.diagonal())
     C = normal.C.copy()
     diagonal = np.arange(C.shape[-1])
     C[:, diagonal, diagonal] *= 1.0 + damping
-    inverse_C, Bt = _inverse(C), np.swapaxes(normal.B, 1, 2)
+    inverse_C, Bt = inverse_of(C), np.swapaxes(normal.B, 1, 2)
     reduce = normal.B @ inverse_C
-    S = A - (reduce @ Bt).sum(axis=0)
-    by_globals = _inverse(S) @ ((reduce @ normal.b[..., None]).sum(axis=0)[:, 0] - normal.a)
+    S = A - _summed(reduce, normal.B)
+    by_globals = _solved(S, (reduce @ normal.b[..., None]).sum(axis=0)[:, 0] - normal.a)
     by_locals = -(inverse_C @ (normal.b + Bt @ by_globals)[..., None])[..., 0]
     return by_globals, by_locals
 
 
-def _covariance(normal: _Normal) -> tuple[Array, Array]:
-    inverse_C = _inverse(normal.C)
+def _covariance(normal: Normal) -> tuple[Array, Array]:
+    inverse_C = inverse_of(normal.C)
     reduce = normal.B @ inverse_C
-    S = normal.A - (reduce @ np.swapaxes(normal.B, 1, 2)).sum(axis=0)
-    globals_covariance = _inverse(S)
+    S = normal.A - _summed(reduce, normal.B)
+    globals_covariance = inverse_of(S)
     locals_covariance = inverse_C + np.swapaxes(reduce, 1, 2) @ globals_covariance @ reduce
     return globals_covariance, locals_covariance
 
 
-def _inverse(matrices: Array) -> Array:
+def _summed(one: Array, other: Array) -> Array:
+    """sum_i one_i other_i^T (g, g) of (n, g, l), as one product of matrices."""
+    g = one.shape[1]
+    flat = [np.moveaxis(part, 1, 0).reshape(g, -1) for part in (one, other)]
+    return np.asarray(flat[0] @ flat[1].T)
+
+
+def _solved(S: Array, right: Array) -> Array:
+    """S^-1 right (g,), whether or not everything is observed."""
+    size = np.sqrt(np.maximum(S.diagonal(), 1e-300))
+    try:
+        factor = cho_factor(S / np.outer(size, size), check_finite=False)
+    except LinAlgError:
+        return np.asarray(inverse_of(S) @ right)
+    return np.asarray(cho_solve(factor, right / size, check_finite=False) / size)
+
+
+def inverse_of(matrices: Array) -> Array:
     """Inverse of symmetric positive matrices (..., m, m), scaled to a unit diagonal first since
     pixels, radians and metres differ by orders of magnitude. A direction that nothing observes
     gets a huge variance instead of an exception."""

@@ -37,6 +37,9 @@ def _complete(incomplete: str) -> list[str]:
 def run(
     procedure: Annotated[str | None, typer.Argument(autocompletion=_complete)] = None,
     param: Annotated[list[str] | None, typer.Option("--param", metavar="NAME=VALUE")] = None,
+    dense: Annotated[
+        bool, typer.Option("--dense", help="With projector: a Gray code, as --param dense=true.")
+    ] = False,
     resume: Annotated[str | None, typer.Option(metavar="RUN", help="Go on with a run.")] = None,
     step: Annotated[bool, typer.Option("--step", help="Ask before every motion.")] = False,
     speed: Annotated[float, typer.Option(help="Percent of the configured speed.")] = 100.0,
@@ -50,7 +53,7 @@ def run(
     cell: CellId = None,
 ) -> int:
     """Start a procedure, or go on with a run, and wait for its result. Ctrl-C detaches."""
-    params = parse_params(param or [])
+    params = parse_params([*(param or []), *(["dense=true"] if dense else [])])
     if resume and (params or step or speed != 100.0 or request_id):
         raise BadInput("--resume goes on as the run was started: no --param, --step or --speed")
     with connect(endpoint, cell) as client:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from cellctl.arms import JOINTS
@@ -12,6 +14,7 @@ from cellctl.geometry import Array
 from cellctl.procedures import pen
 from cellctl.procedures.planning import reach, retrace
 from cellctl.run import Run
+from cellctl.store.history import Sample
 
 MOVE_TIMEOUT_S = 120.0
 LIFT_SPEED_M_S = 0.05
@@ -19,9 +22,16 @@ LIFT_SPEED_M_S = 0.05
 
 def gone(run: Run) -> Array:
     """Corners (n, 6) of all that the arm has gone along in this run, oldest first."""
-    steps = run.all_samples().values()
-    ways = [s.data["way"] for step in steps for s in step.values() if "way" in s.data]
-    return np.array([corner for way in ways for corner in way]).reshape(-1, JOINTS)
+    return ways(run.all_samples())
+
+
+def ways(steps: Mapping[str, Mapping[str, Sample]]) -> Array:
+    """Corners (n, 6) of the ways in the samples of all steps, oldest first; a step may have been
+    left and taken up again."""
+    samples = [sample for step in steps.values() for sample in step.values()]
+    samples.sort(key=lambda sample: sample.n)
+    corners = [corner for s in samples if "way" in s.data for corner in s.data["way"]]
+    return np.array(corners).reshape(-1, JOINTS)
 
 
 async def posture(run: Run, cell: Cell) -> Array:

@@ -1,7 +1,8 @@
 """The projector: markers are shown on the free table and found by the camera.
 
 Several pictures, because 12 x 20 markers at once would be too small in the camera. In the end the
-first one is shown again: what moved in between spoils the result, and is noticed.
+first one is shown again: what moved in between spoils the result, and is noticed. With `dense` the
+pictures between are those of a Gray code (procedures/light_code.py).
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from cellctl.calib import patterns, projector
+from cellctl.calib import dense, patterns, projector
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.camera import CameraModel
+from cellctl.calib.dense import CodeSeen
 from cellctl.calib.projector import LensPrior, ProjectorResult
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
 from cellctl.errors import DeviceFault
+from cellctl.procedures import light_code
 from cellctl.procedures.capture import darken, grab_still, mean_image
 from cellctl.procedures.knowledge import Knowledge, known, lens_prior, table_plane
 from cellctl.procedures.observations import picture
@@ -38,25 +41,30 @@ Markers = dict[int, Any]
 
 
 class ProjectorParams(BaseModel):
-    """The grid of markers and in how many pictures it is shown."""
+    """The grid of markers and in how many pictures it is shown; or, `dense`, a Gray code whose
+    finest stripes are `stripe_px` projector pixels wide."""
 
     model_config = ConfigDict(extra="forbid")
 
     columns: int = Field(default=20, ge=4, le=50)
     rows: int = Field(default=12, ge=3, le=50)
     pictures: int = Field(default=4, ge=1, le=16)
+    dense: bool = False
+    stripe_px: int = Field(default=8, ge=2, le=64)
     max_held_out_px: float = Field(default=2.0, gt=0)
     max_shift_px: float = Field(default=0.3, gt=0)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the camera found: markers in each picture, and where the projector put them."""
+    """What the camera found: markers in each picture, and where the projector put them. If a
+    code was shown these are places of a grid, and `code` is all that was read."""
 
     pictures: list[Markers]
     centres: Markers
     before: Markers
     again: Markers
+    code: CodeSeen | None = None
 
 
 def pictures_of(config: CellConfig, params: ProjectorParams) -> list[patterns.MarkerPicture]:
@@ -71,7 +79,11 @@ async def collect(run: Run, cell: Cell, params: ProjectorParams, knowledge: Know
     shown = pictures_of(cell.config, params)
     if not run.samples(AGAIN):
         await park(run, cell, knowledge.T_world_camera, PICTURES)
-    await _take(run, cell, PICTURES, shown)
+    if params.dense:
+        await _take(run, cell, BEFORE, shown[:1])
+        await light_code.take(run, cell, params.stripe_px)
+    else:
+        await _take(run, cell, PICTURES, shown)
     await _take(run, cell, AGAIN, shown[:1])
     await darken(cell)
 
@@ -124,12 +136,26 @@ def journalled(sample: Sample) -> Markers:
 def seen(record: Record[ProjectorParams]) -> Shown:
     """What was recorded; without a look before, the first picture is compared with the last."""
     shown = pictures_of(record.config, record.params)
+    if record.params.dense:
+        return _seen_densely(record, shown[:1])
     pictures = _found(record, PICTURES, shown)
     return Shown(
         pictures=pictures,
         centres={number: c for pattern in shown for number, c in pattern.centres.items()},
         before=(_found(record, BEFORE, shown) or pictures)[0],
         again=_found(record, AGAIN, shown)[0],
+    )
+
+
+def _seen_densely(record: Record[ProjectorParams], first: list[patterns.MarkerPicture]) -> Shown:
+    code = light_code.seen(record, record.params.stripe_px)
+    places, pixels = code.markers
+    return Shown(
+        pictures=[places],
+        centres=pixels,
+        before=_found(record, BEFORE, first)[0],
+        again=_found(record, AGAIN, first)[0],
+        code=code,
     )
 
 
@@ -153,6 +179,8 @@ def _markers_in(sample: Sample, *, again: bool) -> Markers:
 
 def solve(shown: Shown, camera: CameraModel, lens: LensPrior) -> ProjectorResult:
     """Pure: the map from the camera's to the projector's picture."""
+    if shown.code is not None:
+        return dense.solve_dense(shown.code, camera, lens=lens)
     return projector.solve_projector(shown.pictures, shown.centres, camera, lens=lens)
 
 

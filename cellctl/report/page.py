@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cellctl.errors import printable
 from cellctl.report import (
+    accuracy,
     arrows,
     coverage,
     photos,
@@ -33,6 +34,7 @@ from cellctl.store.run_folder import report_path
 SECTIONS: tuple[tuple[str, Callable[[Recorded], Section]], ...] = (
     ("stages", stage_table.section),
     ("table", arrows.section),
+    ("accuracy", accuracy.section),
     ("coverage", coverage.section),
     ("residuals", residuals.section),
     ("refinement", refinement.section),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cellctl.geometry import Array
+from cellctl.geometry import Array, Mask
 from cellctl.sim.bodies import Body, bodies, plate_points
 from cellctl.sim.truth import Truth
 from cellctl.sim.view import Capsule, Plate
@@ -22,6 +22,7 @@ FOREARM = 3
 """Links up to this DH frame are what the bracket could be swung into."""
 SWUNG = ("tray", "pen")
 """What is checked against them; the boards lie on the tray."""
+DEVICES, TABLE, ARM = ("camera", "projector"), "table", "arm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,36 +53,43 @@ class Obstacles:
         travel = truth.preset.pen.travel_m
         self._balls = [_balls(body, travel) for body in bodies(truth) if body.frame > 0]
 
-    def gaps(self, frames: Array) -> tuple[Array, list[tuple[str, str]]]:
-        """Gaps (n, pairs) at true link frames (n, 7, 4, 4), and the names of the pairs."""
-        columns, names = [], []
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """What can touch what."""
+        return [(balls.name, other) for balls in self._balls for other in self._others(balls)]
+
+    def gaps(self, frames: Array, which: Mask | None = None) -> Array:
+        """Gaps (n, k) at true link frames (n, 7, 4, 4), of the `pairs` that `which` marks."""
+        wanted = iter(np.ones(len(self.pairs), bool) if which is None else which)
+        columns = []
         for balls in self._balls:
-            points = _moved(frames[:, balls.frame], balls.points)
-            for name, gap in self._around(points).items():
-                columns.append(gap - balls.radius)
-                names.append((balls.name, name))
-            pressed = _moved(frames[:, balls.frame], balls.pressed)
-            columns.append(self._above_table(pressed).min(axis=1) - balls.radius)
-            names.append((balls.name, "table"))
-            if balls.name in SWUNG:
-                columns.append(self._to_links(points, frames) - balls.radius)
-                names.append((balls.name, "arm"))
-        return np.stack(columns, axis=1), names
+            others = [other for other in self._others(balls) if next(wanted)]
+            at = frames[:, balls.frame]
+            points = _moved(at, balls.points) if set(others) - {TABLE} else np.empty((0, 0, 3))
+            for other in others:
+                near = _moved(at, balls.pressed) if other == TABLE else points
+                columns.append(self._to(other, near, frames) - balls.radius)
+        return np.stack(columns, axis=1)
 
     def nearest(self, frames: Array) -> Contact:
         """The smallest gap at one set of link frames (7, 4, 4)."""
-        gaps, names = self.gaps(frames[None])
-        pair = int(gaps[0].argmin())
-        return Contact(float(gaps[0, pair]), names[pair])
+        gaps = self.gaps(frames[None])[0]
+        pair = int(gaps.argmin())
+        return Contact(float(gaps[pair]), self.pairs[pair])
 
-    def _around(self, points: Array) -> dict[str, Array]:
-        """Gaps (n,) from points (n, k, 3) in the world to camera and projector."""
+    def _others(self, balls: Balls) -> tuple[str, ...]:
+        return (*DEVICES, TABLE, ARM) if balls.name in SWUNG else (*DEVICES, TABLE)
+
+    def _to(self, other: str, points: Array, frames: Array) -> Array:
+        """Gaps (n,) from points (n, k, 3) in the world to one other thing."""
+        if other == TABLE:
+            return np.asarray(self._above_table(points).min(axis=1))
+        if other == ARM:
+            return self._to_links(points, frames)
         truth = self._truth
-        bodies_at = {"camera": truth.camera.pose, "projector": truth.projector.pose}
-        return {
-            name: _distance(points, pose.translation).min(axis=1) - truth.preset.body_radius_m
-            for name, pose in bodies_at.items()
-        }
+        device = truth.camera if other == "camera" else truth.projector
+        away = _distance(points, device.pose.translation).min(axis=1)
+        return np.asarray(away - truth.preset.body_radius_m)
 
     def _above_table(self, points: Array) -> Array:
         """Height (...,) over the table top; beside it, the distance to its upper edge."""

@@ -38,9 +38,12 @@ def place(world: World, point: Array, rotation: Array) -> float:
     above[:3, 3] -= ABOVE_M * rotation[:, 2]
     undo = np.linalg.inv(pose_matrix(slip[3:], slip[:3]))
     here = world.arm.read(world.now).joints
-    over = _reached(world, above @ undo, here, f"above {_named(point)}")
-    down = _reached(world, target @ undo, over, _named(point))
-    return world.arm.place(world.now, np.array([*_lifted(world, here), over, down]), SLOWLY, slip)
+    lifted = _lifted(world, here)
+    for over in _reached(world, above @ undo, here, f"above {_named(point)}"):
+        down = _reached(world, target @ undo, over, _named(point))[0]
+        if world.arm.is_clear(np.array([*(lifted or [here]), over, down])):
+            return world.arm.place(world.now, np.array([*lifted, over, down]), SLOWLY, slip)
+    raise MotionRefused(f"on every way to {_named(point)} the arm would touch something")
 
 
 def _lifted(world: World, here: Array) -> list[Array]:
@@ -53,13 +56,13 @@ def _lifted(world: World, here: Array) -> list[Array]:
 
 
 def _reached(world: World, target: Array, near: Array, what: str) -> Array:
-    """Joints (6,) of the true arm with its flange at `target` (4, 4), of those near to `near`."""
+    """Joints (n, 6) of the true arm with its flange at `target` (4, 4), nearest to `near` first."""
     arm = world.truth.arm
     starts = np.vstack([near, ik.random_starts(arm, STARTS, seed=0)])
     found = ik.solutions(arm, target[None], near, starts)[0]
     if not len(found):
         raise MotionRefused(f"the pen does not reach {what} with the flange turned like that")
-    return np.asarray(found[0])
+    return found
 
 
 def _named(point: Array) -> str:

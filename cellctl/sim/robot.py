@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
 from cellctl.arms import JOINTS
 from cellctl.errors import DeviceFault, MotionRefused
-from cellctl.geometry import Array
+from cellctl.geometry import Array, Mask
 from cellctl.sim.contact import Obstacles
 from cellctl.sim.motion import RING_S, TICK_S, Limits, Motion
 from cellctl.sim.noise import keyed
@@ -18,6 +19,8 @@ from cellctl.sim.truth import Truth
 SERVO_SIGMA_RAD = 1e-5
 """How far from the target the servos come to rest; the encoders see it."""
 HISTORY_S = 60.0
+STRAIGHT_STEPS = 40
+"""In which a way is looked at beforehand."""
 GRAZE_M = 1e-3
 """An arm that was stopped by a contact may move on if the overlap does not grow by more."""
 
@@ -114,14 +117,17 @@ class Arm:
     def draw(
         self, now: float, waypoints: Array, limits: Limits, index: str, share: float = 1.0
     ) -> float:
-        """Start a stroke; returns when it ends. Ink flows for `share` of its way on paper."""
+        """Start a stroke; returns when it ends. Ink flows for `share` of its way on paper. One
+        that begins with the pen on the paper belongs to the stroke before: it lifts the pen."""
         self._ready(now, waypoints)
         seed, preset = self._truth.seed, self._truth.preset
+        lifts_only = self.pen_is_down(now)
         self._trace(now, waypoints, limits, index)
         self.pen.way_left = np.inf
-        slipped = keyed(seed, "slip", index).normal(0.0, preset.pen_slip_sigma_m, 2)
-        self.pen.slip = np.array([*slipped, 0.0])
-        self.pen.stroke, self.pen.strokes = self.pen.strokes, self.pen.strokes + 1
+        if not lifts_only:
+            slipped = keyed(seed, "slip", index).normal(0.0, preset.pen_slip_sigma_m, 2)
+            self.pen.slip = np.array([*slipped, 0.0])
+            self.pen.stroke, self.pen.strokes = self.pen.strokes, self.pen.strokes + 1
         if share < 1.0:
             self.pen.weaken(self._press(now), share)
         return self._foresee(now)
@@ -252,6 +258,13 @@ class Arm:
         t = np.array([now])
         return bool(self.pen.press(t, self._motion.frames(t)).depth[0] >= 0)
 
+    def is_clear(self, waypoints: Array) -> bool:
+        """Whether nothing would touch anything on straight joint ways through (n, 6)."""
+        shares = np.linspace(0.0, 1.0, STRAIGHT_STEPS)[:, None]
+        ways = [a + shares * (b - a) for a, b in itertools.pairwise(waypoints)]
+        gaps = self._obstacles.gaps(self._truth.arm.link_frames(np.concatenate(ways)))
+        return bool((gaps > 0).all())
+
     def look_ahead(self, now: float) -> None:
         """Something has changed: see again where the motion leads, and what the pen writes."""
         self.pen.unwrite(now)
@@ -302,19 +315,19 @@ class Arm:
     def _touches_at(self, now: float) -> Event | None:
         """The first contact of anything else with anything."""
         times = np.arange(now, self._motion.standstill_at() + TICK_S, TICK_S)
-        gaps, pairs = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
+        gaps = self._obstacles.gaps(self._motion.frames(times[::COARSE]))
         limit = np.minimum(0.0, gaps[0] - GRAZE_M * (gaps[0] < 0))
         reach = NEAR_STROKE_M if self._stroking else NEAR_M
-        near = np.repeat((gaps < limit + reach).any(axis=1), COARSE)
-        around = np.convolve(near, np.ones(2 * COARSE + 1), "same")[: len(times)] > 0
-        if not around.any():
+        near = gaps < limit + reach
+        which, times = near.any(axis=0), times[_around(near.any(axis=1), len(times))]
+        if not len(times):
             return None
-        times = times[around]
-        gaps, pairs = self._obstacles.gaps(self._motion.frames(times))
+        gaps, limit = self._obstacles.gaps(self._motion.frames(times), which), limit[which]
         touching = gaps < limit
         if not touching.any():
             return None
         first = int(touching.any(axis=1).argmax())
+        pairs = [pair for pair, wanted in zip(self._obstacles.pairs, which, strict=True) if wanted]
         pair = pairs[int(np.where(touching[first], gaps[first], np.inf).argmin())]
         return Event(float(times[first]), pair, f"{pair[0]} touched {pair[1]}")
 
@@ -329,3 +342,9 @@ class Arm:
         first, last = max(near[0] - 1, 0), min(near[-1] + 1, len(coarse) - 1)
         t = np.arange(coarse[first], coarse[last] + WRITING_S / 2, WRITING_S)
         return self.pen.press(t, self._motion.frames(t))
+
+
+def _around(coarse: Mask, count: int) -> Mask:
+    """Which of `count` ticks are close to those of every COARSE ticks that are marked."""
+    every = np.repeat(coarse, COARSE)
+    return np.asarray(np.convolve(every, np.ones(2 * COARSE + 1), "same")[:count] > 0)

@@ -115,8 +115,10 @@ def address(*parts: str) -> str:
 
 @dataclass(frozen=True)
 class Sample:
-    """One recorded sample. `data` went through JSON, whether or not the run was resumed since."""
+    """One recorded sample, the entry `n` of the journal. `data` went through JSON, whether or not
+    the run was resumed since."""
 
+    n: int
     key: str
     data: dict[str, Any]
     images: dict[str, Picture]
@@ -137,7 +139,7 @@ class History:
         """Take in one more event."""
         data = entry.data
         if entry.kind == "sample":
-            self._samples.setdefault(entry.at, {})[data["key"]] = self._sample(data)
+            self._samples.setdefault(entry.at, {})[data["key"]] = self._sample(entry)
         elif entry.kind == "record":
             self._records.setdefault((entry.at, data["name"]), []).append(data["data"])
         elif entry.kind == "result":
@@ -159,9 +161,10 @@ class History:
         """The result that the procedure came to, if it did."""
         return self._result
 
-    def _sample(self, data: dict[str, Any]) -> Sample:
+    def _sample(self, entry: Entry) -> Sample:
+        data = entry.data
         images = {
             name: Picture(self._directory / named["file"], named["sha256"])
             for name, named in data["images"].items()
         }
-        return Sample(data["key"], data["data"], images)
+        return Sample(entry.n, data["key"], data["data"], images)

@@ -17,11 +17,11 @@ from cellctl.calib.projector import LensPrior, solve_projector
 from cellctl.calib.refine_fit import Mark
 from cellctl.geometry import Array, Transform, pose_matrix
 from cellctl.sim.grid import Grid, drawing_joints
-from cellctl.sim.presets import PRESETS
+from cellctl.sim.presets import PRESETS, Preset
 from cellctl.sim.truth import Truth, draw
 from tests.calib.numeric_cell import numeric_cell
 
-SLIP_MM, REPEAT_MM, DETECTION_PX = 0.15, 0.07, 0.03
+REPEAT_MM, DETECTION_PX = 0.07, 0.03
 MARKER_PX = 0.035
 YAWS = np.radians([0.0, 60.0, -60.0])
 SPOTS = (4, 3)
@@ -69,7 +69,7 @@ class DrawnCell:
         """Circles drawn at xy (n, 2), in rounds of 12, the yaw changing from one to the next."""
         yaws = YAWS[np.arange(len(xy)) % 3] if yaws is None else yaws
         pen = self.truth.pen_lands(xy, self.joints(xy, yaws))
-        sigma = 1e-3 * noise * np.hypot(SLIP_MM, REPEAT_MM)
+        sigma = noise * np.hypot(self.truth.preset.pen_slip_sigma_m, 1e-3 * REPEAT_MM)
         pen[:, :2] += rng.normal(0.0, sigma, (len(xy), 2))
         return self.seen(xy, yaws, pen, rng, noise)
 
@@ -100,10 +100,10 @@ def layout(truth: Truth, rng: np.random.Generator, rounds: int = 5, jitter: floa
     return truth.preset.table.centre_m[:2] + places * half
 
 
-def quick_cell(seed: int, preset: str = "cr") -> DrawnCell:
+def quick_cell(seed: int, preset: str | Preset = "cr") -> DrawnCell:
     """A cell whose base calibration is off as a solved one is, but was not solved: camera and
     hand-eye perturbed from the truth, the projector map from noisy markers."""
-    truth = draw(PRESETS[preset], seed)
+    truth = draw(PRESETS[preset] if isinstance(preset, str) else preset, seed)
     rng = np.random.default_rng([seed, 55])
     lens = truth.camera.lens
     scale = lens.size[0] / 1920

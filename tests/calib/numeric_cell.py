@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from cellctl.calib.views import RobotView
 from cellctl.geometry import Array, Transform, invert, pose_matrix
 from cellctl.sim.cell_config import cell_document
 from cellctl.sim.grid import Grid
-from cellctl.sim.presets import CR
+from cellctl.sim.presets import CR, Preset
 from cellctl.sim.truth import Rng, Truth, draw
 
 CORNER_NOISE_PX = 0.07
@@ -49,38 +50,54 @@ class NumericCell:
         return self.known.points
 
 
-def numeric_cell(seed: int, intrinsic: int = 30, hand_eye: int = 10) -> NumericCell:
-    truth = draw(CR, seed)
+Poser = Callable[[Truth, str, int, Rng], list[Array]]
+"""Joints (6,) of the nominal arm that show the board of that name, so many or more of them."""
+
+
+def random_poses(truth: Truth, name: str, count: int, rng: Rng) -> list[Array]:
+    """Anywhere in the CR's picture."""
+    wanted = _board_poses(truth, name, 4 * count, rng)
+    return _reachable(truth, wanted @ invert(truth.boards[name].pose.matrix))
+
+
+def numeric_cell(
+    seed: int,
+    intrinsic: int = 30,
+    hand_eye: int = 10,
+    preset: Preset = CR,
+    poser: Poser = random_poses,
+) -> NumericCell:
+    truth = draw(preset, seed)
     rng = np.random.default_rng([seed, 99])
     pictures = marker_pictures(truth.projector.lens.size)
-    sizes = CR.boards
+    sizes = preset.boards
     checkerboard = Chessboard(sizes.inner_corners, sizes.square_m)
-    markers = ArucoGrid(sizes.markers, sizes.marker_m, sizes.pitch_m, "DICT_4X4_50")
+    markers = ArucoGrid(sizes.markers, sizes.marker_m, sizes.pitch_m, sizes.dictionary)
     return NumericCell(
         truth=truth,
-        intrinsic=_views(truth, "checkerboard", checkerboard.points, intrinsic, rng),
-        hand_eye=_views(truth, "markers", markers.points, hand_eye, rng),
+        intrinsic=_views(truth, "checkerboard", checkerboard.points, intrinsic, poser, rng),
+        hand_eye=_views(truth, "markers", markers.points, hand_eye, poser, rng),
         pictures=[_seen(truth, picture.centres, rng) for picture in pictures],
         centres={i: c for picture in pictures for i, c in picture.centres.items()},
-        factory=_factory(seed),
+        factory=_factory(preset, seed),
         known=Grid(truth),
     )
 
 
-def _factory(seed: int) -> CameraModel:
+def _factory(preset: Preset, seed: int) -> CameraModel:
     """The maker's values, as the simulated cell's config has them."""
-    camera = cell_document(CR, seed)["camera"]
+    camera = cell_document(preset, seed)["camera"]
     (fx, fy), (cx, cy) = camera["factory"]["focal_px"], camera["factory"]["centre_px"]
     vector = np.array([fx, fy, cx, cy, *camera["factory"]["distortion"]])
     return CameraModel.from_vector(vector, tuple(camera["image_size_px"]))
 
 
-def _views(truth: Truth, name: str, points: Array, count: int, rng: Rng) -> list[RobotView]:
+def _views(
+    truth: Truth, name: str, points: Array, count: int, poser: Poser, rng: Rng
+) -> list[RobotView]:
     views: list[RobotView] = []
     while len(views) < count:
-        wanted = _board_poses(truth, name, 4 * count, rng)
-        flanges = wanted @ invert(truth.boards[name].pose.matrix)
-        for joints in _reachable(truth, flanges):
+        for joints in poser(truth, name, count, rng):
             pixels = _picture(truth, name, points[:, :2], joints, rng)
             if pixels is not None and len(views) < count:
                 reported = Transform("world", "flange", truth.nominal_arm.forward(joints))

@@ -110,7 +110,6 @@ VIEW = {"id": "0", "image": "images/0.png"}
         (document(format="cellctl-dataset/9"), "format must be 'cellctl-dataset/1'"),
         (document(kind="projector"), "unknown kind 'projector'; known: intrinsic, hand-eye"),
         (document(kind="markers"), "'markers' cannot be solved by this version"),
-        (document(kind="projector-graycode"), "'projector-graycode' cannot be solved"),
         (document(image_size=[640]), "image_size"),
         (document(image_size=[640.5, 480]), "image_size"),
         (document(board={"type": "chess"}), "board: unknown board type 'chess'"),

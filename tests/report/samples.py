@@ -249,6 +249,7 @@ def solved(drawn: list[dict[str, Any]]) -> dict[str, Any]:
                 if circle["key"] in held_out
             ],
         },
+        "accuracy": accuracy(),
         "table": table(),
         "arrows": {row: arrows(good, held_out, i) for i, row in enumerate(ROWS)},
     }
@@ -278,6 +279,28 @@ def hand_eye(per_view: dict[str, float]) -> dict[str, Any]:
             key: {"rms_px": 0.28 * v, "held_out_px": 0.38 * v, "off_mm": 0.2, "off_deg": 0.05}
             for key, v in per_view.items()
         },
+    }
+
+
+def accuracy() -> dict[str, Any]:
+    grid = [(x, y) for x in np.linspace(-0.33, 0.33, 7) for y in np.linspace(-0.63, -0.25, 5)]
+    return {
+        "predicted_mm": 0.118,
+        "map": {"places": [[x, y, 0.09 + 0.4 * (x**2 + (y + 0.44) ** 2)] for x, y in grid]},
+        "budget": [
+            {"source": "hand-eye", "rms_mm": 0.021},
+            {"source": "drawing", "rms_mm": 0.104},
+            {"source": "projector", "rms_mm": 0.043},
+        ],
+        "next": [
+            {"do": "draw 60 circles more", "predicted_mm": 0.088},
+            {"do": "take 30 views of the checkerboard more", "predicted_mm": 0.117},
+        ],
+        "curve": [
+            {"circles": n, "predicted_mm": 0.9 / n**0.5, "held_out_mm": 0.2 + 1.1 / n}
+            for n in (6, 12, 24, 36, 48, 60)
+        ],
+        "enough": "After 36 circles the error falls by less than 5 % with each dozen.",
     }
 
 

@@ -21,6 +21,7 @@ from tests.report.pages import read_page
 ORDER = [
     "stages",
     "table",
+    "accuracy",
     "coverage",
     "residuals",
     "refinement",
@@ -72,6 +73,16 @@ def test_the_table_has_ours_and_the_papers_and_says_what_only_a_simulation_knows
         for value in (training, held_out, true, paper_px, paper_mm):
             assert figure(value) in line
     assert "true: known only in simulation" in table
+
+
+def test_what_error_to_expect_why_and_what_to_do(page):
+    told = page.section("accuracy")
+    assert "0.118 mm" in told  # predicted
+    assert "0.212 mm" in told  # measured
+    assert "Most of the error comes from: drawing." in told
+    assert told.index("draw 60 circles more") < told.index("take 30 views")
+    assert "After 36 circles" in told
+    assert page.html.count('class="heat"') == 35
 
 
 def test_each_stage_has_a_map_with_its_magnification(page):

@@ -257,6 +257,8 @@ def test_bodies_of_camera_and_projector_can_be_touched(truth, device):
     for away, touched in ((0.03, True), (0.13, False)):
         pose = Transform("world", device, pose_matrix((np.pi, 0, 0), flange + (0, 0, 0.1 + away)))
         moved = replace(truth, **{device: replace(getattr(truth, device), pose=pose)})
-        gaps, names = Obstacles(moved).gaps(truth.arm.link_frames(WORK)[None])
-        near = min(gap for gap, (_, other) in zip(gaps[0], names, strict=True) if other == device)
+        obstacles = Obstacles(moved)
+        gaps = obstacles.gaps(truth.arm.link_frames(WORK)[None])[0]
+        named = zip(gaps, obstacles.pairs, strict=True)
+        near = min(gap for gap, (_, other) in named if other == device)
         assert (near < 0) == touched

@@ -1,0 +1,1 @@
+"""The joint adjustment of everything that was seen of a cell."""
