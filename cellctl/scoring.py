@@ -17,7 +17,7 @@ from cellctl.calib.intrinsic import IntrinsicResult
 from cellctl.calib.observe import observe, observe_with_robot
 from cellctl.calib.score import Score, score_camera, score_hand_eye
 from cellctl.calib.views import Rejection
-from cellctl.dataset import Dataset, load_dataset
+from cellctl.dataset import PROJECTOR_KIND, Dataset, load_dataset
 from cellctl.errors import BadInput
 from cellctl.offline import answer, require_board
 
@@ -45,7 +45,7 @@ def solve_and_score(folder: Path, other: Path) -> dict[str, Any]:
     if any(projectors):
         raise BadInput(
             f"{other}: cannot score a calibration from {folder}: only one of them is of kind "
-            f"{projector_data.KIND!r}"
+            f"{PROJECTOR_KIND!r}"
         )
     trained, unseen = load_dataset(folder), load_dataset(other)
     _require_alike(trained, unseen)

@@ -204,8 +204,7 @@ def _normal(problem: Problem[State], state: State, huber: float) -> Normal:
 def _add(normal: Normal, part: Linearised) -> None:
     r, G, L = part.rows
     columns, views = part.columns, part.views
-    # one product of matrices, not one a view; there may be no globals
-    tall = G.reshape(G.shape[0] * G.shape[1], G.shape[-1])
+    tall = G.reshape(G.shape[0] * G.shape[1], G.shape[2])  # one product of matrices, not one a view
     square = (columns, columns) if isinstance(columns, slice) else np.ix_(columns, columns)
     normal.A[square] += tall.T @ tall
     normal.a[columns] += tall.T @ r.reshape(-1)
@@ -241,8 +240,8 @@ def _covariance(normal: Normal) -> tuple[Array, Array]:
 
 def _summed(one: Array, other: Array) -> Array:
     """sum_i one_i other_i^T (g, g) of (n, g, l), as one product of matrices."""
-    g = one.shape[1]
-    flat = [np.moveaxis(part, 1, 0).reshape(g, -1) for part in (one, other)]
+    n, g, size = one.shape
+    flat = [np.moveaxis(part, 1, 0).reshape(g, n * size) for part in (one, other)]
     return np.asarray(flat[0] @ flat[1].T)
 
 
