@@ -21,7 +21,7 @@ from cellctl.calib.projector_map import (
 from cellctl.calib.schur import Linearised, Priors, minimise
 from cellctl.calib.views import Rejection, rms
 from cellctl.errors import SolveError
-from cellctl.geometry import Array, Mask
+from cellctl.geometry import Array, Mask, invert, transform_points
 
 MINIMUM_MARKERS = 12
 PLANE_TOLERANCE = 0.0025
@@ -163,6 +163,34 @@ def judge(
             "fix them and run again"
         )
     return ("fail" if reasons else "pass"), tuple(reasons)
+
+
+def turned_deg(
+    measured: ProjectorMap,
+    T_world_camera: Array,
+    T_world_projector: Array,
+    lens: LensPrior,
+    *,
+    spot: Array,
+) -> float:
+    """By how much the picture is turned, at a `spot` (3,) of the table, against a projector of
+    that lens at that pose."""
+    points = spot + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    seen = transform_points(invert(T_world_camera), points)
+    lit = transform_points(invert(T_world_projector), points)
+    pixels = measured.project(seen[:, :2] / seen[:, 2:])
+    expected = lens.focal_px * lit[:, :2] / lit[:, 2:]
+    turn = (pixels[1:] - pixels[0]).T @ np.linalg.inv((expected[1:] - expected[0]).T)
+    return float(np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
+
+
+def judge_turn(degrees: float) -> tuple[str, ...]:
+    """Why a picture that is turned so fails."""
+    reason = (
+        "the projector's picture is upside down against the projector's pose in the config: switch "
+        "its ceiling mode, or correct the pose"
+    )
+    return (reason,) if abs(degrees) > 135.0 else ()
 
 
 def shift_px(before: Mapping[int, Array], after: Mapping[int, Array]) -> float:
