@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ from cellctl import projector_data
 from cellctl.calib import hand_eye, intrinsic
 from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import usable_views
+from cellctl.calib.charuco import OTHER_PATTERN
+from cellctl.calib.hand_eye_result import HandEyeResult
 from cellctl.calib.intrinsic import IntrinsicLimits, IntrinsicResult
 from cellctl.calib.observe import NOT_FOUND, Observed, observe, observe_with_robot
 from cellctl.calib.views import Rejection, View
@@ -32,33 +34,50 @@ def solve_folder(folder: Path) -> dict[str, Any]:
     return solve_dataset(folder)
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What `cellctl solve --json` prints, and the result that it tells of, if there is one."""
+
+    document: dict[str, Any]
+    result: IntrinsicResult | HandEyeResult | None = None
+
+
 def solve_dataset(folder: Path) -> dict[str, Any]:
-    """Solve the data set in `folder`: what `cellctl solve --json` prints.
+    """Solve the data set in `folder`: what `cellctl solve --json` prints; see `answer`."""
+    return answer(load_dataset(folder)).document
+
+
+def answer(dataset: Dataset) -> Answer:
+    """Solve a data set.
 
     BadInput names what cannot be used, a board that no picture shows included. When what is there
     does not determine an answer, the verdict is a fail with that reason. The order of the views
     does not matter.
     """
-    dataset = load_dataset(folder)
     solve = {"intrinsic": _solve_intrinsic, "hand-eye": _solve_hand_eye}[dataset.kind]
-    return {"kind": dataset.kind, **solve(dataset)}
+    solved = solve(dataset)
+    return Answer({"kind": dataset.kind, **solved.document}, solved.result)
 
 
-def _solve_intrinsic(dataset: Dataset) -> dict[str, Any]:
+def _solve_intrinsic(dataset: Dataset) -> Answer:
     seen = observe(dataset.board, dataset.images())
-    _require_board(seen, dataset, "views")
+    if _other_pattern(seen):
+        return Answer(_unsolved(SolveError(OTHER_PATTERN), seen, dataset))
+    require_board(seen, dataset, "views")
     try:
         result = _camera_from(seen, dataset, dataset.image_size)
     except SolveError as error:
-        return _unsolved(error, seen, dataset)
+        return Answer(_unsolved(error, seen, dataset))
     _, reasons = intrinsic.judge(result)
-    return _judged(reasons, result.to_dict())
+    return Answer(_judged(reasons, result.to_dict()), result)
 
 
-def _solve_hand_eye(dataset: Dataset) -> dict[str, Any]:
+def _solve_hand_eye(dataset: Dataset) -> Answer:
     assert dataset.mount is not None
     seen = observe_with_robot(dataset.board, dataset.images_with_robot())
-    _require_board(seen, dataset, "views")
+    if _other_pattern(seen):
+        return Answer(_unsolved(SolveError(OTHER_PATTERN), seen, dataset))
+    require_board(seen, dataset, "views")
     doubts: tuple[str, ...] = ()
     camera: CameraModel | None = None
     extra: dict[str, Any] = {}
@@ -73,10 +92,10 @@ def _solve_hand_eye(dataset: Dataset) -> dict[str, Any]:
             minimum_points=dataset.board.minimum_points,
         )
     except SolveError as error:
-        return {**_unsolved(error, seen, dataset), **extra}
+        return Answer({**_unsolved(error, seen, dataset), **extra})
     result = replace(result, rejected=_merged(result.rejected, seen.unseen))
     _, reasons = hand_eye.judge(result)
-    return {**_judged((*doubts, *reasons), result.to_dict()), **extra}
+    return Answer({**_judged((*doubts, *reasons), result.to_dict()), **extra}, result)
 
 
 def _camera_from(
@@ -95,7 +114,7 @@ def _camera_that_came_along(
     """The camera from the data set's own intrinsic pictures, for the hand-eye pictures' size;
     why it is not good enough; and what there is to say about it."""
     seen = observe(dataset.board, dataset.intrinsic_images())
-    _require_board(seen, dataset, "intrinsic_images")
+    require_board(seen, dataset, "intrinsic_images")
     try:
         result = _camera_from(seen, dataset, dataset.intrinsic_image_size)
     except SolveError as error:
@@ -112,7 +131,14 @@ def _camera_that_came_along(
     return camera, tuple(f"intrinsic_images: {doubt}" for doubt in doubts), {"intrinsic": facts}
 
 
-def _require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
+def _other_pattern(seen: Observed[Any]) -> bool:
+    """Whether no picture shows the board because its `legacy` is stated wrong: its pictures are
+    sound, so that is a verdict on what was stated."""
+    return not seen.sights and any(OTHER_PATTERN in unseen.reason for unseen in seen.unseen)
+
+
+def require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
+    """BadInput when no picture shows the board."""
     if seen.sights:
         return
     board = ", ".join(f"{name} {value}" for name, value in dataset.board.to_dict().items())
@@ -131,7 +157,8 @@ def _judged(reasons: Sequence[str], solved: dict[str, Any]) -> dict[str, Any]:
 def _unsolved(error: SolveError, seen: Observed[Any], dataset: Dataset) -> dict[str, Any]:
     """No answer, said as every answer is: pictures that are too few or too alike are no misuse."""
     _, few = usable_views(seen.views, dataset.board.minimum_points)
-    rejected = [rejection.to_dict() for rejection in _merged(few, seen.unseen)]
+    told = [Rejection(name, reason) for name, reason in error.details.get("views", {}).items()]
+    rejected = [rejection.to_dict() for rejection in _merged([*few, *told], seen.unseen)]
     return _judged([error.message], {"views": {"used": [], "rejected": rejected}})
 
 

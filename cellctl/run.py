@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from cellctl.cell import Cell, Solver
 from cellctl.drivers.base import SAMPLE, Image
-from cellctl.errors import BadInput
+from cellctl.errors import BadInput, SolveError
 from cellctl.explain import explain
 from cellctl.messages import Progress, Verdict
 from cellctl.store.history import Sample, address
@@ -50,6 +50,11 @@ class Result:
     ) -> Result:
         """A failed one when there are reasons, else one that passes."""
         return cls("fail" if reasons else "pass", reasons, data, calibration)
+
+    @classmethod
+    def unsolved(cls, kind: str, error: SolveError) -> Result:
+        """A failed one of a procedure whose data determine no answer."""
+        return cls("fail", [error.message], {"kind": kind})
 
     def __post_init__(self) -> None:
         if self.verdict not in ("pass", "fail"):

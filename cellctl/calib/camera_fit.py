@@ -75,6 +75,19 @@ class CameraFit:
         sigma[list(free.intrinsics)] = np.sqrt(variance * variances)
         return sigma
 
+    def rescaled(self, factor: float) -> CameraFit:
+        """The same fit to a board of another size: only lengths change."""
+        batch, sheet = self.chain.batch, self.chain.sheet
+        chain = replace(
+            self.chain,
+            batch=Batch(factor * batch.points, batch.pixels, batch.seen),
+            sheet=Sheet(factor * sheet.centre, factor * sheet.half),
+        )
+        poses = self.state.corrections.copy()
+        poses[:, :3, 3] *= factor
+        state = replace(self.state, corrections=poses, warp=factor * self.state.warp)
+        return CameraFit(self.names, chain, replace(self.solution, problem=chain, state=state))
+
     def without(self, view: int) -> CameraFit:
         """Fitted again without one view, from here."""
         return self.over(np.arange(len(self.names)) != view)

@@ -30,7 +30,7 @@ so many squares away: more than a lens bends them, less than another board does.
 ALMOST_ALL = 0.9
 OTHER_PATTERN = (
     "its markers are where the other pattern for even numbers of rows has them: the board's "
-    "legacy is stated wrong"
+    "legacy is stated wrong; state the other value (true or false)"
 )
 MOVED = 0.2
 """Refinement may move a crossing by that many squares."""

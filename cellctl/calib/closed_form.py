@@ -11,7 +11,8 @@ times the others' error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 
@@ -32,6 +33,8 @@ METHODS = (*HAND_EYE, "shah")
 SUBSETS, SUBSET_SIZE = 60, 4
 LEVER_M = 0.5
 """An angle of a discrepancy counts like the way of a point at this distance."""
+SCALE_WEIGHT_M = 0.01
+"""What a board of twice its stated size costs beside discrepancies, metres."""
 
 
 def closed_form(method: str, A: Array, C: Array) -> tuple[Array, Array]:
@@ -102,16 +105,72 @@ def robust_start(A: Array, C: Array) -> tuple[Array, Array]:
     Least median of squares (Rousseeuw, 1984), with always the same subsets. It stands almost
     half of the views being wrong. SolveError when no subset determines the answer.
     """
-    best, best_score = None, np.inf
+    start = _consensus(A, C, _park)
+    return start.X, start.Y
+
+
+def scaled_start(A: Array, C: Array) -> Consensus:
+    """As `robust_start`, for boards whose stated size may be wrong by any factor: it is the
+    factor by which the pictures' translations have to be multiplied. Negative for mirrored
+    pictures: a mirror turns every rotation into one about another axis, and every translation
+    into its opposite."""
+    return _consensus(A, C, _park_and_scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """X, Y (4, 4) and the board's `scale`; the median discrepancy of the views in metres and
+    in radians, and both as one length, `score`."""
+
+    X: Array
+    Y: Array
+    scale: float
+    shift: float
+    angle: float
+    score: float
+
+
+def _park(A: Array, C: Array) -> tuple[Array, Array, float]:
+    return *closed_form("park", A, C), 1.0
+
+
+def _park_and_scale(A: Array, C: Array) -> tuple[Array, Array, float]:
+    """Rotations by Park; then translations and scale s, in which A Y = X C is linear:
+    R_A t_Y + t_A = s R_X t_C + t_X. A scale that the motion does not show stays at one."""
+    X, Y = closed_form("park", A, C)
+    n = len(A)
+    M = np.zeros((3 * n + 1, 7))
+    M[:-1, :3] = A[:, :3, :3].reshape(-1, 3)
+    M[:-1, 3:6] = -np.tile(np.eye(3), (n, 1))
+    M[:-1, 6] = -(C[:, :3, 3] @ X[:3, :3].T).reshape(-1)
+    M[-1, 6] = SCALE_WEIGHT_M
+    b = np.append(-A[:, :3, 3].reshape(-1), SCALE_WEIGHT_M)
+    found = np.linalg.lstsq(M, b, rcond=None)[0]
+    X, Y = X.copy(), Y.copy()
+    Y[:3, 3], X[:3, 3] = found[:3], found[3:6]
+    return X, Y, float(found[6])
+
+
+def scaled(C: Array, scale: float) -> Array:
+    """Poses (n, 4, 4) with their translations multiplied."""
+    C = C.copy()
+    C[:, :3, 3] *= scale
+    return C
+
+
+def _consensus(
+    A: Array, C: Array, solve: Callable[[Array, Array], tuple[Array, Array, float]]
+) -> Consensus:
+    best: Consensus | None = None
     for subset in _subsets(len(A)):
         try:
-            X, Y = closed_form("park", A[subset], C[subset])
+            X, Y, scale = solve(A[subset], C[subset])
         except SolveError:
             continue
-        shift, angle = discrepancies(X, Y, A, C)
-        score = float(np.median(shift + LEVER_M * angle))
-        if score < best_score:
-            best, best_score = (X, Y), score
+        shifts, angles = discrepancies(X, Y, A, scaled(C, scale))
+        score = float(np.median(shifts + LEVER_M * angles))
+        if best is None or score < best.score:
+            best = Consensus(X, Y, scale, float(np.median(shifts)), float(np.median(angles)), score)
     if best is None:
         raise SolveError(
             "the robot's poses do not determine hand-eye: the flange has to turn about at least "

@@ -16,18 +16,26 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.camera_fit import (
     MINIMUM_POINTS,
     MINIMUM_VIEWS,
-    CameraFit,
     require_views,
     usable_views,
 )
-from cellctl.calib.chain import ChainState, Free
+from cellctl.calib.chain import ChainState, Free, Sheet
 from cellctl.calib.closed_form import (
     axis_scatter_deg,
-    consistent_options,
     discrepancies,
     robust_start,
+    scaled,
+    scaled_start,
 )
+from cellctl.calib.drift import Drift, find_drift
 from cellctl.calib.hand_eye_choice import Candidate, choose, evaluate, leave_one_out
+from cellctl.calib.hand_eye_faults import (
+    Evidence,
+    SolvedChain,
+    board_factor,
+    explained,
+    require_sense,
+)
 from cellctl.calib.hand_eye_fit import (
     ROBOT_SIGMA,
     Job,
@@ -35,18 +43,17 @@ from cellctl.calib.hand_eye_fit import (
     Noise,
     Option,
     PosePriors,
-    Possible,
     RobotData,
     adjust,
     estimate_noise,
     options,
-    possible_poses,
+    predicted,
 )
 from cellctl.calib.hand_eye_result import HandEyeLimits, HandEyeResult, HandEyeView, judge
-from cellctl.calib.intrinsic import best_camera
+from cellctl.calib.hand_eye_sight import Sight, look, oriented
 from cellctl.calib.pose import pose_vectors
 from cellctl.calib.schur import minimise
-from cellctl.calib.views import Rejection, RobotView, noise_px, ordered, rms
+from cellctl.calib.views import Rejection, RobotView, ordered, rms
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, Transform, invert, rotation_angle, transform_points
 
@@ -83,81 +90,57 @@ def solve_hand_eye(
     every = ordered(views)
     usable, rejected = usable_views(every, minimum_points)
     require_views(usable, rejected, NEED)
-    job, disagreeing = _job(usable, mount, camera, image_size, priors, minimum_points)
+    sight = look(usable, camera, image_size, minimum_points)
+    rejected = [*rejected, *sight.lost]
+    require_views(sight.views, rejected, NEED)
+    job, gross, factor = _job(sight, mount, priors)
     job, strained = _without_strained(job)
-    rejected = sorted([*rejected, *disagreeing, *strained], key=lambda r: r.id)
-    require_views(job.data.views, rejected, NEED)
-    result = _result(job, every, _candidates(job), board)
+    require_views(job.data.views, [*rejected, *gross, *strained], NEED)
+    wrong = _explained(job, sight, [*gross, *strained], factor)
+    rejected = sorted([*rejected, *wrong], key=lambda r: r.id)
+    result = _result(job, every, _candidates(job), board, factor)
     return replace(result, rejected=tuple(rejected))
 
 
-def _job(
-    views: list[RobotView],
-    mount: Mount,
-    camera: CameraModel | None,
-    image_size: tuple[int, int] | None,
-    priors: PosePriors,
-    minimum_points: int,
-) -> tuple[Job, list[Rejection]]:
-    """Camera, poses of the board in it, orientation of the board, start; gross errors out."""
-    if camera is not None:
-        fit, rejected, warp = None, list[Rejection](), np.zeros(3)
-        found, lost = possible_poses(views, camera)
-    else:
-        fit, rejected = _camera_of(views, image_size, minimum_points)
-        fit, found, lost = located(views, fit)
-        camera, warp = fit.camera, fit.state.warp
-    rejected = [*rejected, *lost]
-    require_views([view for view in views if view.id in found], rejected, NEED)
-    views, boards, noise = _oriented(list(found.values()), mount, camera)
+def _job(sight: Sight, mount: Mount, priors: PosePriors) -> tuple[Job, list[Rejection], float]:
+    """Orientation of the board, start; gross errors out; and the factor by which the board was
+    enlarged because it is another one than stated."""
+    views, boards, noise = oriented(list(sight.found.values()), mount, sight.camera)
     data = RobotData.of(views, mount)
+    start = scaled_start(data.reported, boards)
+    require_sense(Evidence.of(list(sight.found.values()), mount), start)
+    factor = board_factor(start)
+    fit, boards, warp = sight.fit, scaled(boards, factor), factor * sight.warp
+    if factor != 1.0:
+        views = [replace(view, points=factor * view.points) for view in views]
+        data = RobotData.of(views, mount)
+        fit = fit and fit.rescaled(factor)
     X, Y = robust_start(data.reported, boards)
-    start = ChainState(camera, X, Y, data.no_corrections, warp=warp)
+    state = ChainState(sight.camera, X, Y, data.no_corrections, warp=warp)
     noise = fit.sigma_px if fit else noise
-    job, gross = _without_gross(Job(data, boards, start, Noise(noise, ROBOT_SIGMA), priors, fit))
-    return estimate_noise(job), [*rejected, *gross]
+    job, gross = _without_gross(Job(data, boards, state, Noise(noise, ROBOT_SIGMA), priors, fit))
+    return estimate_noise(job), gross, factor
 
 
-def _camera_of(
-    views: list[RobotView], image_size: tuple[int, int] | None, minimum_points: int
-) -> tuple[CameraFit, list[Rejection]]:
-    """A camera from the hand-eye views themselves."""
-    if image_size is None:
-        raise SolveError("a camera or the size of the pictures is needed")
-    best = best_camera(views, image_size, minimum_points=minimum_points)
-    return best.fit, best.rejected
-
-
-def located(
-    views: list[RobotView], fit: CameraFit
-) -> tuple[CameraFit, dict[str, Possible], list[Rejection]]:
-    """What the pictures allow under a camera that came from them. A view that has no pose under
-    it is lost to the camera too, which may cost another view its pose."""
-    lost: list[Rejection] = []
-    while True:
-        used = [view for view in views if view.id in fit.names]
-        found, more = possible_poses(used, fit.camera)
-        lost += more
-        if not more or len(found) < MINIMUM_VIEWS:
-            return fit, found, lost
-        fit = fit.over(np.isin(fit.names, list(found)))
-
-
-def _oriented(
-    found: Sequence[Possible], mount: Mount, camera: CameraModel
-) -> tuple[list[RobotView], Array, float]:
-    """Views with the board turned the same way in all of them, the poses of the board, and the
-    noise of a coordinate of a corner in px."""
-    views = [possible[0][0] for possible in found]
-    poses = [np.stack([pose.matrix for _, pose in possible]) for possible in found]
-    places = consistent_options(RobotData.of(views, mount).reported, poses)
-    chosen = [possible[i] for possible, i in zip(found, places, strict=True)]
-    errors = [
-        camera.project(transform_points(pose.matrix, view.points)) - view.pixels
-        for view, pose in chosen
-    ]
-    boards = np.stack([pose.matrix for _, pose in chosen])
-    return [view for view, _ in chosen], boards, noise_px(np.concatenate(errors))
+def _explained(job: Job, sight: Sight, rejected: list[Rejection], factor: float) -> list[Rejection]:
+    """With what has happened to views whose robot pose does not fit."""
+    if not rejected:
+        return []
+    state, data = job.start, job.data
+    shifts, angles = discrepancies(state.camera_pose, state.board_pose, data.reported, job.boards)
+    chain = SolvedChain(
+        state.camera_pose,
+        state.board_pose,
+        data.mount,
+        float(np.median(shifts)),
+        float(np.median(angles)),
+    )
+    possible = {
+        name: scaled(np.stack([pose.matrix for _, pose in options]), factor)
+        for name, options in sight.found.items()
+    }
+    points = factor * np.concatenate([view.points for view in sight.views])
+    return explained(chain, rejected, sight.views, possible, np.unique(points, axis=0))
 
 
 def _without_gross(job: Job) -> tuple[Job, list[Rejection]]:
@@ -231,13 +214,19 @@ def _candidates(job: Job) -> list[Candidate]:
 
 
 def _result(
-    job: Job, every: Sequence[RobotView], candidates: Sequence[Candidate], board: str
+    job: Job,
+    every: Sequence[RobotView],
+    candidates: Sequence[Candidate],
+    board: str,
+    factor: float,
 ) -> HandEyeResult:
     """All that can be said about the chosen candidate; rejections are added by the caller."""
     chosen, why = choose(candidates)
     data, state = job.data, chosen.state
     names = {view.id for view in data.views}
-    others = [_predicted(view, job, state) for view in every if view.id not in names]
+    sheet = Sheet(data.sheet.centre / factor, data.sheet.half / factor)
+    whole = replace(state, log_scale=state.log_scale + float(np.log(factor)))
+    others = [predicted(view, whole, data.mount, sheet) for view in every if view.id not in names]
     anchor, mount = _frames(data)
     return HandEyeResult(
         mount=data.mount,
@@ -248,8 +237,10 @@ def _result(
         chosen=chosen.option.name,
         why=why,
         candidates=tuple(candidates),
-        scale=float(np.exp(state.log_scale)),
+        scale=float(np.exp(whole.log_scale)),
         warp=state.warp,
+        sheet=sheet,
+        pitch_m=_pitch(every),
         robot_sigma=job.noise.robot,
         axis_scatter_deg=axis_scatter_deg(data.reported),
         rms_px=chosen.rms_px,
@@ -257,7 +248,40 @@ def _result(
         held_out_used_px=chosen.held_out_px,
         views=_views(data, chosen),
         rejected=(),
+        drift=_drift(job),
+        turned=_turned(data.views, every, factor),
     )
+
+
+def _turned(
+    used: Sequence[RobotView], every: Sequence[RobotView], factor: float
+) -> tuple[str, ...]:
+    """Views whose board had to be turned against the others'."""
+    given = {view.id: factor * view.points for view in every}
+    turned = {view.id for view in used if not np.allclose(view.points, given[view.id])}
+    if 2 * len(turned) > len(used):
+        turned = {view.id for view in used} - turned
+    return tuple(sorted(turned))
+
+
+def _drift(job: Job) -> Drift | None:
+    """What pictures and robot disagree about, at the middle of the board, view by view."""
+    state, data = job.start, job.data
+    chain = data.chain(Free())
+    D = state.corrections
+    middle = transform_points(state.board_pose, np.append(data.sheet.centre, 0.0))
+    at = chain.after @ np.append(middle, 1.0)
+    shifts = ((D - np.eye(4)) @ at[..., None])[:, :3, 0]
+    frames = chain.before if data.mount == "eye-to-hand" else invert(chain.after)
+    names = [view.id for view in data.views]
+    return find_drift(names, pose_vectors(D)[:, :3], shifts, frames[:, :3, :3])
+
+
+def _pitch(views: Sequence[RobotView]) -> float:
+    """The side of a square or marker, or the spacing of dots, as stated: the smallest distance
+    between points that follow each other, metres."""
+    steps = [np.linalg.norm(np.diff(view.points, axis=0), axis=1) for view in views]
+    return float(np.concatenate(steps).min())
 
 
 def _frames(data: RobotData) -> tuple[str, str]:
@@ -281,18 +305,6 @@ def _views(data: RobotData, chosen: Candidate) -> tuple[HandEyeView, ...]:
         )
         for i, view in enumerate(data.views)
     )
-
-
-def _predicted(view: RobotView, job: Job, state: ChainState) -> Array:
-    """Errors (k, 2) of a view that the fit does not rest on, in its best orientation. What would
-    lie behind the camera counts as a picture's diagonal."""
-    diagonal = float(np.linalg.norm(state.camera.image_size))
-    found = []
-    for turn in view.symmetries:
-        turned = replace(view, points=transform_points(turn, view.points))
-        one = RobotData((turned,), job.data.mount, job.data.sheet)
-        found.append(np.nan_to_num(one.through_robot(state)[0], nan=diagonal))
-    return min(found, key=rms)
 
 
 def _spread(data: RobotData, state: ChainState) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from cellctl.calib.chain import FULL, Chain, ChainState, Free, PosePrior, Sheet
 from cellctl.calib.closed_form import METHODS, closed_form
 from cellctl.calib.pose import BoardPose, board_poses, pose_vectors
 from cellctl.calib.schur import Solution, minimise
-from cellctl.calib.views import Batch, Rejection, RobotView
+from cellctl.calib.views import Batch, Rejection, RobotView, rms
 from cellctl.errors import SolveError
 from cellctl.geometry import Array, invert, transform_points
 
@@ -82,6 +82,19 @@ class RobotData:
     def through_robot(self, state: ChainState) -> Array:
         """Errors (n, k, 2) in px when the robot is believed; see `Chain.errors`."""
         return self.chain(Free()).errors(replace(state, corrections=self.no_corrections))
+
+
+def predicted(view: RobotView, state: ChainState, mount: Mount, sheet: Sheet) -> Array:
+    """Errors (k, 2) px of a view that a fit does not rest on, seen through the robot, with its
+    board turned as fits best. What would lie behind the camera counts as a picture's diagonal."""
+    diagonal = float(np.linalg.norm(state.camera.image_size))
+    found = []
+    for turn in view.symmetries:
+        turned = replace(view, points=transform_points(turn, view.points))
+        one = RobotData((turned,), mount, sheet)
+        unturned = replace(state, corrections=one.no_corrections)
+        found.append(np.nan_to_num(one.through_robot(unturned)[0], nan=diagonal))
+    return min(found, key=rms)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from cellctl.calib.camera import CameraModel
+from cellctl.calib.chain import ChainState, Sheet
+from cellctl.calib.drift import Drift
 from cellctl.calib.hand_eye_choice import Candidate
 from cellctl.calib.hand_eye_fit import Mount
 from cellctl.calib.views import Rejection, shortage
@@ -37,6 +39,10 @@ class HandEyeResult:
     """`camera_pose` is T_base_camera or T_flange_camera, `board_pose` T_flange_board or
     T_base_board. `covariance` (12, 12) is that of small turns (rad) and shifts (m) of both, each
     in its own child frame. `candidates` are all ways that were tried; `why` says why `chosen`.
+    `scale` and `warp` are those of the board, over its `sheet`: see chain.Sheet;
+    `pitch_m` is the side of its squares or markers, or the spacing of its dots, as stated.
+    `drift` is a trend in the order of the views; `turned` are the views in which the board was
+    numbered from its other end.
     """
 
     mount: Mount
@@ -49,6 +55,8 @@ class HandEyeResult:
     candidates: tuple[Candidate, ...]
     scale: float
     warp: Array
+    sheet: Sheet
+    pitch_m: float
     robot_sigma: Array
     axis_scatter_deg: Array
     rms_px: float
@@ -56,6 +64,31 @@ class HandEyeResult:
     held_out_used_px: float
     views: tuple[HandEyeView, ...]
     rejected: tuple[Rejection, ...]
+    drift: Drift | None = None
+    turned: tuple[str, ...] = ()
+
+    @property
+    def state(self) -> ChainState:
+        """The chain, without corrections of any view."""
+        return ChainState(
+            self.camera,
+            self.camera_pose.matrix,
+            self.board_pose.matrix,
+            np.zeros((0, 4, 4)),
+            float(np.log(self.scale)),
+            self.warp,
+        )
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was noticed, and is no reason to doubt the result by itself."""
+        remarks = [str(self.drift)] if self.drift else []
+        if self.turned:
+            remarks.append(
+                f"the board looks turned by half a turn in views {', '.join(self.turned)}: a print "
+                "that is its own half turn may be numbered from either end; it was undone"
+            )
+        return remarks
 
     @property
     def summary(self) -> dict[str, float]:
@@ -90,6 +123,7 @@ class HandEyeResult:
             "camera": self.camera.to_dict(),
             camera: self.camera_pose.to_list(),
             board: self.board_pose.to_list(),
+            "remarks": self.remarks,
             "method": self.chosen,
             "why": self.why,
             "candidates": {
@@ -121,6 +155,8 @@ class HandEyeLimits:
     rejected: float = 1.0 / 3.0
     spread_mm: float = 5.0
     scale: float = 0.01
+    drift_mm: float = 1.0
+    drift_deg: float = 0.1
 
 
 def judge(
@@ -136,6 +172,9 @@ def judge(
             f"three axes; at least {limits.scatter_deg[0]:.0f} and {limits.scatter_deg[1]:.0f} "
             "are needed about the weaker two: add views tilted about other axes"
         )
+    drift = result.drift
+    if drift is not None and (drift.mm > limits.drift_mm or drift.deg > limits.drift_deg):
+        reasons.append(f"{drift}; fix it, let it warm up, and take the views again")
     reasons += _errors(result, limits)
     return ("fail" if reasons else "pass"), tuple(reasons)
 
@@ -146,18 +185,22 @@ def _errors(result: HandEyeResult, limits: HandEyeLimits) -> list[str]:
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: look for a camera or a board that is loose, and compare the "
+            "poses that the robot reports with where it is"
         )
     spread = result.summary["spread_rms_mm"]
     if not spread <= limits.spread_mm:
         reasons.append(
             f"pictures and robot disagree about the board by {spread:.1f} mm, over the limit of "
-            f"{limits.spread_mm} mm"
+            f"{limits.spread_mm} mm: check that each pose is that of its picture, and that nothing "
+            "is loose"
         )
     if not abs(result.scale - 1.0) <= limits.scale:
         way = "smaller" if result.scale < 1.0 else "larger"
+        stated = 1e3 * result.pitch_m
         reasons.append(
-            f"the board is {100 * abs(result.scale - 1.0):.1f} % {way} than stated, by the "
-            "robot's measure: measure the board"
+            f"the board is {100 * abs(result.scale - 1.0):.1f} % {way} than stated, by the robot's "
+            f"measure: what should be {stated:.2f} mm seems to be {stated * result.scale:.2f} mm; "
+            "measure the board and state that"
         )
     return reasons

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 
 from cellctl.calib.camera import INTRINSICS, CameraModel
 from cellctl.calib.camera_fit import MINIMUM_POINTS, CameraFit, CameraOption, fit_camera
-from cellctl.calib.chain import Chain, Free
+from cellctl.calib.chain import Chain, ChainState, Free, Sheet
 from cellctl.calib.pose import board_pose
 from cellctl.calib.schur import minimise
 from cellctl.calib.views import Batch, Rejection, View, excess, ordered, rms, shortage
@@ -35,7 +35,8 @@ class IntrinsicResult:
     """`sigma` (9,) are the standard deviations of camera.vector. `rms_px` is that of the used
     views; `held_out_px` counts every view, `held_out_used_px` those that the fit rests on.
     `coverage` is the part of the picture inside the hull of all corners. `warp` (3,) is how far
-    the board is bent, metres: see chain.Sheet; zero if the views do not show that it is."""
+    the board is bent over its `sheet`, metres: see chain.Sheet; zero if the views do not show that
+    it is."""
 
     camera: CameraModel
     sigma: Array
@@ -46,6 +47,7 @@ class IntrinsicResult:
     rejected: tuple[Rejection, ...]
     coverage: float
     warp: Array
+    sheet: Sheet
 
     @property
     def used(self) -> list[str]:
@@ -85,7 +87,7 @@ def judge(
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: check that the pictures are sharp and the board is flat"
         )
     focal_sigma = float(np.max(result.sigma[:2] / result.camera.vector[:2]))
     if not focal_sigma <= limits.focal_sigma:
@@ -159,18 +161,23 @@ def _choose(attempts: Sequence[CameraAttempt]) -> CameraAttempt:
 
 
 def _held_out(view: View, fit: CameraFit) -> Array:
-    """Errors (n, 2) of a view under a camera that never saw it, its own pose fitted.
-
-    None, (0, 2), of a view whose points do not fix a pose.
-    """
+    """Errors (n, 2) of a view under a camera that never saw it; see `predicted`."""
     rest = fit.without(fit.names.index(view.id)) if view.id in fit.names else fit
+    return predicted(view, rest.camera, rest.state.warp, rest.chain.sheet, rest.sigma_px)
+
+
+def predicted(
+    view: View, camera: CameraModel, warp: Array, sheet: Sheet, sigma_px: float = 1.0
+) -> Array:
+    """Errors (n, 2) of a view under a camera, only the pose of its board, bent by `warp` over
+    `sheet`, being fitted. None, (0, 2), of a view whose points do not fix a pose."""
     try:
-        pose = board_pose(view, rest.camera).matrix
+        pose = board_pose(view, camera).matrix
     except SolveError:
         return np.zeros((0, 2))
     one = np.eye(4)[None]
-    chain = Chain(Batch.of([view]), one, one, rest.chain.sheet, Free(), rest.sigma_px)
-    state = replace(rest.state, corrections=pose[None])
+    chain = Chain(Batch.of([view]), one, one, sheet, Free(), sigma_px)
+    state = ChainState(camera, one[0], one[0], pose[None], warp=warp)
     return chain.errors(minimise(chain, state).state)[0]
 
 
@@ -190,6 +197,7 @@ def _result(attempt: CameraAttempt, image_size: tuple[int, int]) -> IntrinsicRes
         rejected=tuple(attempt.rejected),
         coverage=_coverage(fit.chain.batch.pixels[seen], image_size),
         warp=fit.state.warp,
+        sheet=fit.chain.sheet,
     )
 
 

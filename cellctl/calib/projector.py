@@ -21,7 +21,7 @@ from cellctl.calib.projector_map import (
 from cellctl.calib.schur import Linearised, Priors, minimise
 from cellctl.calib.views import Rejection, rms
 from cellctl.errors import SolveError
-from cellctl.geometry import Array, Mask
+from cellctl.geometry import Array, Mask, invert, transform_points
 
 MINIMUM_MARKERS = 12
 PLANE_TOLERANCE = 0.0025
@@ -143,7 +143,10 @@ def judge(
     reasons = []
     seen = len(result.used) + len(result.rejected)
     if len(result.used) < limits.markers:
-        reasons.append(f"only {len(result.used)} markers on the table; {limits.markers} are needed")
+        reasons.append(
+            f"only {len(result.used)} markers on the table, {limits.markers} are needed: clear the "
+            "table and the beam, and check focus and exposure"
+        )
     if len(result.used) < limits.used * seen:
         reasons.append(
             f"only {len(result.used)} of {seen} markers lie on one plane: clear the table"
@@ -151,14 +154,43 @@ def judge(
     if not result.held_out_used_px <= limits.held_out_px:
         reasons.append(
             f"held-out error {result.held_out_used_px:.2f} projector px, over the limit of "
-            f"{limits.held_out_px} px"
+            f"{limits.held_out_px} px: check the projector's focus, and that the table is flat"
         )
     if shift is not None and not shift <= limits.shift_px:
         reasons.append(
             f"the markers moved by {shift:.2f} camera px while calibrating, more than "
-            f"{limits.shift_px} px: camera, projector or table was touched"
+            f"{limits.shift_px} px: camera, projector or table was touched: "
+            "fix them and run again"
         )
     return ("fail" if reasons else "pass"), tuple(reasons)
+
+
+def turned_deg(
+    measured: ProjectorMap,
+    T_world_camera: Array,
+    T_world_projector: Array,
+    lens: LensPrior,
+    *,
+    spot: Array,
+) -> float:
+    """By how much the picture is turned, at a `spot` (3,) of the table, against a projector of
+    that lens at that pose."""
+    points = spot + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    seen = transform_points(invert(T_world_camera), points)
+    lit = transform_points(invert(T_world_projector), points)
+    pixels = measured.project(seen[:, :2] / seen[:, 2:])
+    expected = lens.focal_px * lit[:, :2] / lit[:, 2:]
+    turn = (pixels[1:] - pixels[0]).T @ np.linalg.inv((expected[1:] - expected[0]).T)
+    return float(np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
+
+
+def judge_turn(degrees: float) -> tuple[str, ...]:
+    """Why a picture that is turned so fails."""
+    reason = (
+        "the projector's picture is upside down against the projector's pose in the config: switch "
+        "its ceiling mode, or correct the pose"
+    )
+    return (reason,) if abs(degrees) > 135.0 else ()
 
 
 def shift_px(before: Mapping[int, Array], after: Mapping[int, Array]) -> float:

@@ -47,12 +47,16 @@ class Rejection:
 
 
 def shortage(used: int, rejected: int, least: int, share: float) -> list[str]:
-    """Reasons against a verdict: fewer than `least` views used, more than `share` rejected."""
+    """Reasons against a verdict, and what to do: fewer than `least` views used, more than `share`
+    rejected."""
     reasons = []
     if used < least:
-        reasons.append(f"only {used} views could be used; at least {least} are needed")
+        reasons.append(f"only {used} views could be used; at least {least} are needed: add views")
     if rejected > share * (used + rejected):
-        reasons.append(f"{rejected} of {used + rejected} views were rejected")
+        reasons.append(
+            f"{rejected} of {used + rejected} views were rejected: see why, view by view, "
+            "and take them again"
+        )
     return reasons
 
 

@@ -35,13 +35,21 @@ def check_config(file: ConfigFile, as_json: AsJson = False) -> None:
 
 def solve(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A data set or a run.")],
+    score: Annotated[
+        Path | None,
+        typer.Option(metavar="OTHER", help="A data set of the same set-up to score it on."),
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Calibrate from a folder of images and poses, or solve a recorded run again."""
+    """Calibrate from a folder of images and poses, or solve a recorded run again.
+
+    With --score the calibration predicts the views of OTHER, which it has not seen: score_px.
+    """
     log_to_stderr()
     from cellctl.offline import solve_folder
+    from cellctl.scoring import solve_and_score
 
-    result = solve_folder(folder)
+    result = solve_folder(folder) if score is None else solve_and_score(folder, score)
     if as_json:
         emit(result)
     else:

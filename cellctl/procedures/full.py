@@ -113,7 +113,10 @@ def _next_belief(record: Record[FullParams], start: Knowledge, belief: Belief) -
 def base_of(record: Record[FullParams]) -> Calibration | None:
     """Pure: the calibration with which circles are drawn and found; None when the parts before
     have failed already, and paper would be wasted."""
-    seen = optical.solve(record, record.params)
+    try:
+        seen = optical.solve(record, record.params)
+    except SolveError:  # the end of the run tells why
+        return None
     table = _table(record)
     failed = any(seen.judged(record.params).values())
     if failed or measure_table.judge(table, record.params.measure_table)[1]:
@@ -164,7 +167,10 @@ def _ink(record: Record[FullParams], base: Calibration, seen: Optical) -> Ink:
 def conclude(record: Record[FullParams]) -> Result:
     """Pure: from what was recorded to all results, the tables and the calibration."""
     params = record.params
-    seen = optical.solve(record, params)
+    try:
+        seen = optical.solve(record, params)
+    except SolveError as error:
+        return Result.unsolved("full", error)
     table = _table(record)
     stages = seen.stages(record.config)
     reasons = dict(seen.judged(params))

@@ -11,6 +11,7 @@ from cellctl.calib.camera import CameraModel
 from cellctl.calib.hand_eye import HandEyeResult
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
+from cellctl.errors import SolveError
 from cellctl.procedures import sweep
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits
@@ -74,7 +75,10 @@ def judge(result: HandEyeResult, params: HandEyeParams) -> tuple[str, tuple[str,
 def conclude(record: Record[HandEyeParams]) -> Result:
     """Pure: from what was recorded, and the camera that was known, to the result."""
     views = seen(record)
-    result = solve(views, known(record.config, record.active).camera)
+    try:
+        result = solve(views, known(record.config, record.active).camera)
+    except SolveError as error:
+        return Result.unsolved("hand-eye", error)
     _, reasons = judge(result, record.params)
     data: dict[str, Any] = {"kind": "hand-eye", **views.merged(result.to_dict())}
     return Result.judged(reasons, data)

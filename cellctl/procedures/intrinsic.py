@@ -8,6 +8,7 @@ from cellctl.calib import intrinsic
 from cellctl.calib.intrinsic import IntrinsicResult
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
+from cellctl.errors import SolveError
 from cellctl.procedures import sweep
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits
@@ -69,7 +70,10 @@ def judge(result: IntrinsicResult, params: IntrinsicParams) -> tuple[str, tuple[
 def conclude(record: Record[IntrinsicParams]) -> Result:
     """Pure: from what was recorded to the result."""
     views = seen(record)
-    result = solve(views)
+    try:
+        result = solve(views)
+    except SolveError as error:
+        return Result.unsolved("intrinsic", error)
     _, reasons = judge(result, record.params)
     return Result.judged(reasons, {"kind": "intrinsic", **views.merged(result.to_dict())})
 

@@ -208,8 +208,12 @@ def conclude(record: Record[ProjectorParams]) -> Result:
     """Pure: from what was recorded to the result. A calibration comes of it when the hand-eye
     was known already."""
     shown, knowledge = seen(record), known(record.config, record.active)
-    result = solve(shown, knowledge.camera, lens_prior(record.config))
-    _, reasons = judge(result, shown, record.params)
+    try:
+        result = solve(shown, knowledge.camera, lens_prior(record.config))
+        _, reasons = judge(result, shown, record.params)
+    except SolveError as error:
+        return Result.unsolved("projector", error)
+    reasons = (*reasons, *_upside_down(record.config, knowledge, result))
     data = {"kind": "projector", **result.to_dict()}
     calibration = _calibration(record.config, knowledge, result)
     if calibration is not None and record.params.held:
@@ -236,6 +240,29 @@ def full_model(
     except SolveError as error:
         return None, (error.message,)
     return found.to_dict(), ()
+
+
+def _upside_down(
+    config: CellConfig, knowledge: Knowledge, result: ProjectorResult
+) -> tuple[str, ...]:
+    """As the projector's tape-measured pose has it, which no tape gets wrong by a quarter turn."""
+    pose = config.projector.pose.transform("world", "projector")
+    middle = np.array(config.projector.size_px) / 2.0
+    turn = projector.turned_deg(
+        result.map,
+        knowledge.T_world_camera.matrix,
+        pose.matrix,
+        lens_prior(config),
+        spot=_on_table(config, knowledge, result.map.locate(middle)),
+    )
+    return projector.judge_turn(turn)
+
+
+def _on_table(config: CellConfig, knowledge: Knowledge, xy: Any) -> Any:
+    """The point (3,) of the world's table at normalised camera coordinates (2,)."""
+    T = knowledge.T_world_camera.matrix
+    ray = T[:3, :3] @ np.append(xy, 1.0)
+    return T[:3, 3] + ray * (config.table.touched_height_m - T[2, 3]) / ray[2]
 
 
 def _calibration(

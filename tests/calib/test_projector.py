@@ -14,11 +14,14 @@ from cellctl.calib.projector import (
     LensPrior,
     ProjectorLimits,
     judge,
+    judge_turn,
     shift_px,
     solve_projector,
+    turned_deg,
 )
 from cellctl.calib.projector_map import ProjectorMap, direct_linear_transform
 from cellctl.errors import BadInput, SolveError
+from cellctl.geometry import invert, look_down, transform_points
 from tests.calib.synthetic import CAMERA
 
 H = np.array([[2300.0, 40.0, 980.0], [-30.0, 2250.0, 560.0], [0.08, -0.11, 1.0]])
@@ -187,3 +190,19 @@ def test_dlt_is_exact():
     source = rng.uniform(-1, 1, (3, 6, 2))
     target = ProjectorMap.pinhole(H).project(source)
     assert np.allclose(direct_linear_transform(source, target), H / H[2, 2], rtol=1e-9)
+
+
+def test_upside_down_against_the_config_is_named():
+    """Half a turn of the picture is a good map all the same, of another mounting."""
+    over = look_down(np.array([0.0, -0.44, 1.3]), np.array([0.05, -0.4, 0.0]))
+    camera = look_down(np.array([0.02, -0.45, 0.8]), np.array([0.0, -0.44, 0.0]), yaw=0.5)
+    spot = np.array([0.0, -0.44, 0.0])
+    table = spot + 0.2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    seen_at = transform_points(invert(camera), table)
+    lit = transform_points(invert(over), table)
+    for flip, named in ((1.0, False), (-1.0, True)):
+        pixels = flip * LENS.focal_px * lit[:, :2] / lit[:, 2:] + LENS.centre_px
+        found = direct_linear_transform(seen_at[:, :2] / seen_at[:, 2:], pixels)
+        turn = turned_deg(ProjectorMap.pinhole(found), camera, over, LENS, spot=spot)
+        assert abs(turn) == pytest.approx(180.0 if named else 0.0, abs=0.1)
+        assert ("upside down" in " ".join(judge_turn(turn))) == named
