@@ -15,7 +15,7 @@ from cellctl.sim.truth import Rng, Truth
 SPREADS = {
     ("cr", "checkerboard"): Spread(fill=(0.2, 0.5), spin_deg=25.0),
     ("cr", "markers"): Spread(fill=(0.2, 0.35), about_camera=True),
-    ("ir", "checkerboard"): Spread(fill=(0.05, 0.12), spin_deg=25.0, middle=0.65),
+    ("ir", "checkerboard"): Spread(fill=(0.09, 0.16), spin_deg=25.0, middle=0.65),
     ("ir", "markers"): Spread(fill=(0.06, 0.11), middle=0.31),
 }
 """What `planning.attainable` makes of the procedures' spreads: in the IR cell the arm cannot come

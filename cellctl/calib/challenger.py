@@ -34,22 +34,31 @@ FIELDS_MM = (NO_FIELD_MM, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 """Standard deviations of a coefficient that are tried, for marks of MARK_SIGMA_MM: about how far
 the field moves a circle at the edge of the drawn area, which spans -1 to 1."""
 SEAT_CIRCLES = 4
+RAYLEIGH = 1.1774
+"""Median length of 2-D errors whose coordinates have the standard deviation 1."""
 FREE = 1e-6
 """Weight that keeps a pen's offset finite which no yaw tells from a shift of the table."""
 
 
 def challenger_family(marks: Marks, frame: Frame) -> Family:
     """A free homography, and a field whose size the marks make likeliest."""
-    plain = Family(NAME, LEAST, np.eye(8))
-    field = replace(plain, monomials=MONOMIALS, field_mm=NO_FIELD_MM)
     if len(marks) < LEAST:
-        return field
-    A, r = design(field, marks, frame, fit(plain, marks, frame))
+        return _of_size(NO_FIELD_MM)
+    return _of_size(FIELDS_MM[int(np.argmin(_costs(marks, frame)))])
+
+
+def _of_size(field_mm: float) -> Family:
+    return Family(NAME, LEAST, np.eye(8), monomials=MONOMIALS, field_mm=field_mm)
+
+
+def _costs(marks: Marks, frame: Frame) -> Array:
+    """-2 log of the likelihood of each of FIELDS_MM, up to a constant."""
+    plain = fit(replace(_of_size(np.inf), monomials=0), marks, frame)
+    A, r = design(_of_size(NO_FIELD_MM), marks, frame, plain)
     wide = np.concatenate([A[:, :8], A[:, -2:]], axis=1)
     # A coefficient of one moves a mark by the frame's scale: in units of millimetres instead.
     smooth = A[:, 8:-2] / frame.mm
-    costs = [_restricted(wide, smooth, r, size / MARK_SIGMA_MM) for size in FIELDS_MM]
-    return replace(field, field_mm=FIELDS_MM[int(np.argmin(costs))])
+    return np.array([_restricted(wide, smooth, r, size / MARK_SIGMA_MM) for size in FIELDS_MM])
 
 
 def _restricted(wide: Array, smooth: Array, r: Array, ratio: float) -> float:
@@ -64,6 +73,30 @@ def _restricted(wide: Array, smooth: Array, r: Array, ratio: float) -> float:
     freedom = len(r) - wide.shape[1]
     logs = np.linalg.slogdet(V)[1] + np.linalg.slogdet(normal)[1]
     return float(freedom * np.log(max(left, 1e-30)) + logs)
+
+
+def expected_error_mm(marks: Marks, places: Array) -> float:
+    """What error over world places (g, 2) these marks let expect of the challenger's map, in the
+    drawing posture: root mean square of the 2-D distance, in millimetres. By the covariances for
+    fields of all sizes, each as likely as the marks make it, so that few circles, which do not show
+    a field, do not deny it either. Not-a-number for fewer than LEAST marks."""
+    if len(marks) < LEAST:
+        return float("nan")
+    frame = Frame.of(marks)
+    costs = _costs(marks, frame)
+    weights = np.exp((costs.min() - costs) / 2)
+    variances = [_expected(_of_size(size), marks, frame, places) for size in FIELDS_MM]
+    return float(np.sqrt(np.average(variances, weights=weights)))
+
+
+def _expected(family: Family, marks: Marks, frame: Frame, places: Array) -> float:
+    """Mean variance over the places, square millimetres; by the median error, which a bad circle
+    does not change."""
+    found = fit(family, marks, frame)
+    left = float(np.median(np.linalg.norm(found.errors_mm(marks), axis=1))) / RAYLEIGH
+    sigma2 = left**2 * 2 * len(marks) / max(found.freedom, 1.0)
+    J = design(family, marks.upright_at(places), frame, found)[0]
+    return float(sigma2 * np.einsum("ij,ji->", J, np.linalg.solve(found.normal, J.T)) / len(places))
 
 
 def seated(

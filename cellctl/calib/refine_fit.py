@@ -116,6 +116,14 @@ class Marks:
         xy, turn, seen, mm = self.xy, self.turn, self.seen, self.mm
         return Marks(keys, xy[index], turn[index], seen[index], mm[index], self.table)
 
+    def upright_at(self, xy: Array) -> Marks:
+        """Circles without noise at world places (n, 2) in the drawing posture, as the unrefined
+        chain has them."""
+        seen = apply_homography(self.table, xy)
+        mm = 1e3 * homography_slopes(np.linalg.inv(self.table), seen)
+        keys = tuple(str(i) for i in range(len(xy)))
+        return Marks(keys, xy, np.zeros((len(xy), 2, 2)), seen, mm, self.table)
+
     def stand(self, tcp: Array) -> Array:
         """World places (n, 2), metres, of a pen that is off by tcp (2,) metres."""
         return self.xy + self.turn @ tcp

@@ -14,6 +14,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.calib.calibration import Calibration
+from cellctl.calib.challenger import expected_error_mm
+from cellctl.calib.design import enough
+from cellctl.calib.refine_fit import Marks
+from cellctl.calib.table_surface import Area
 from cellctl.cell import Cell
 from cellctl.config import CellConfig
 from cellctl.drivers.base import StrokeResult
@@ -24,7 +28,7 @@ from cellctl.procedures import drawn, paper, pen_motion, pictures
 from cellctl.procedures.moving import posture
 from cellctl.procedures.pen import PenRig, pen_rig
 from cellctl.procedures.record import Record, recorded
-from cellctl.procedures.spots import PlannedSpot, in_order
+from cellctl.procedures.spots import PlannedSpot, area, in_order
 from cellctl.run import Procedure, Result, Run
 
 CIRCLES = "circles"
@@ -36,7 +40,9 @@ MEASURED = 24
 
 class DrawParams(BaseModel):
     """`spots` circles a round, in `rounds` rounds, all on places of their own. `radius_mm`: 12
-    camera pixels when left out. `search_mm`: how far from its place a circle is looked for."""
+    camera pixels when left out. `search_mm`: how far from its place a circle is looked for.
+    `wanted_mm`: draw no further round when the map's predicted error over the area is not above
+    it, or no longer falls; when left out, all rounds are drawn."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -45,6 +51,7 @@ class DrawParams(BaseModel):
     radius_mm: float | None = Field(default=None, gt=2, le=200)
     pen_speed_mm_s: float = Field(default=60.0, gt=0, le=500)
     search_mm: float = Field(default=15.0, gt=0, le=100)
+    wanted_mm: float | None = Field(default=None, gt=0, le=10)
     seed: int = Field(default=0, ge=0)
 
 
@@ -103,10 +110,10 @@ async def collect(run: Run, cell: Cell, params: DrawParams, base: Calibration) -
     await run.step(CIRCLES, drawing.count * drawing.rounds)
     total = drawing.count * drawing.rounds
     spots = await paper.planned(
-        run, cell, drawing.rig, total, drawing.radius, drawing.seed, sight=sight
+        run, cell, drawing.rig, total, drawing.radius, drawing.seed, sight=sight, telling=True
     )
     search = 1e-3 * params.search_mm
-    place = 0
+    place, predicted = 0, list[float]()
     for number in range(drawing.rounds):
         place = await draw_round(run, cell, drawing, spots, place, number)
         circles = drawn.circles(run.samples(CIRCLES))
@@ -116,6 +123,18 @@ async def collect(run: Run, cell: Cell, params: DrawParams, base: Calibration) -
         if trouble := await run.call(drawn.trouble, so_far, number, base):
             await run.record("stopped", round=number, reason=trouble)
             break
+        if params.wanted_mm is not None:
+            predicted.append(await run.call(predicted_mm, so_far, base, cell.config))
+            if reason := enough(predicted, params.wanted_mm):
+                await run.record("enough", round=number, reason=reason)
+                break
+
+
+def predicted_mm(found: drawn.Drawn, base: Calibration, config: CellConfig) -> float:
+    """Pure: the error of the map over the area that the circles found so far let expect, in mm;
+    not-a-number while they are too few to tell."""
+    circles = Marks.of(found.marks(base.camera), base)
+    return expected_error_mm(circles, Area(*area(config)).grid())
 
 
 async def draw_round(

@@ -3,6 +3,9 @@ used twice, whatever happens in between."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 from cellctl.cell import Cell
 from cellctl.errors import SolveError
 from cellctl.procedures.pen import PenRig
@@ -25,6 +28,7 @@ async def planned(
     *,
     turned: bool = True,
     sight: Sight | None = None,
+    telling: bool = False,
 ) -> list[PlannedSpot]:
     """At least `count` spots for circles of `radius` metres, best spread first, then spares; see
     `plan_spots`.
@@ -34,22 +38,17 @@ async def planned(
     """
     recorded = run.recall(SPOTS)
     if recorded is None:
-        spots = await _enough(run, cell, rig, count, radius, seed, turned=turned, sight=sight)
+        plan = partial(
+            plan_spots, rig, cell.config, radius=radius, seed=seed, turned=turned, sight=sight
+        )
+        spots = await _enough(run, cell, partial(plan, telling=telling), count)
         recorded = {"spots": [spot.to_dict() for spot in spots]}
         await run.record(SPOTS, **recorded)
     return [PlannedSpot.from_dict(spot) for spot in recorded["spots"]]
 
 
 async def _enough(
-    run: Run,
-    cell: Cell,
-    rig: PenRig,
-    count: int,
-    radius: float,
-    seed: int,
-    *,
-    turned: bool,
-    sight: Sight | None,
+    run: Run, cell: Cell, plan: Callable[..., list[PlannedSpot]], count: int
 ) -> list[PlannedSpot]:
     names = [sheet.name for sheet in cell.config.sheets]
     if not names:
@@ -57,9 +56,7 @@ async def _enough(
     while True:
         used = [(name, spot) for name in names for spot in cell.sheets.spots(name)]
         wanted = count + int(SPARES * count)
-        spots: list[PlannedSpot] = await run.call(
-            plan_spots, rig, cell.config, used, wanted, radius, seed, turned, sight
-        )
+        spots: list[PlannedSpot] = await run.call(partial(plan, used=used, count=wanted))
         if len(spots) >= count:
             return spots
         if not used:

@@ -1,5 +1,6 @@
 """Where to touch or draw: spots on the free parts of the sheets that the pen can reach, spread
-over the area to its edges. Pure and deterministic: the same seed and paper give the same spots.
+over the area to its edges, or where circles tell most of the map. Pure and deterministic: the same
+seed and paper give the same spots.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cellctl.calib.design import choose_circles
 from cellctl.config import CellConfig, SheetSection
 from cellctl.geometry import Array, Mask
 from cellctl.procedures.pen import PenRig
@@ -67,8 +69,10 @@ def plan_spots(
     seed: int,
     turned: bool = True,
     sight: Sight | None = None,
+    telling: bool = False,
 ) -> list[PlannedSpot]:
-    """Up to `count` spots for circles of `radius` metres, far from each other, best spread first.
+    """Up to `count` spots for circles of `radius` metres, far from each other, best spread first;
+    `telling`: those first from which the map of the area is known best.
 
     With `turned` the tool's yaw changes from spot to spot as far as the guard allows, so that what
     is off at the tool can be told from what is off in the cell; without, it is 0 where the guard
@@ -86,10 +90,14 @@ def plan_spots(
     if not len(xy):
         return []
     allowed, above = _postures(rig, xy, radius)
-    chosen = _spread(xy, np.logical_or.reduce(allowed, axis=1), count, 2 * radius + MARGIN_M)
+    spacing = 2 * radius + MARGIN_M
+    if telling:
+        chosen = _telling(config, xy, allowed, count, spacing, turned)
+    else:
+        chosen = _spread(xy, np.logical_or.reduce(allowed, axis=1), count, spacing)
     spots = []
     for place, i in enumerate(chosen):
-        turn = next(k for k in _order(place if turned else 0) if allowed[i, k])
+        turn = _turn(allowed[i], place if turned else 0)
         name, yaw = config.sheets[owner[i]].name, float(np.radians(YAWS_DEG[turn]))
         spots.append(PlannedSpot(name, xy[i], yaw, above[i, turn]))
     return spots
@@ -140,10 +148,25 @@ def _postures(rig: PenRig, xy: Array, radius: float) -> tuple[Mask, Array]:
     return allowed.reshape(n, turns), above.reshape(n, turns, -1)
 
 
-def _order(place: int) -> list[int]:
-    """All yaws, beginning with another one at every spot."""
+def _turn(allowed: Mask, place: int) -> int:
+    """The first of the yaws (yaws,) that are allowed, beginning with another one at every spot."""
     turns = len(YAWS_DEG)
-    return [(place + k) % turns for k in range(turns)]
+    return next(k % turns for k in range(place, place + turns) if allowed[k % turns])
+
+
+def _telling(
+    config: CellConfig, xy: Array, allowed: Mask, count: int, spacing: float, turned: bool
+) -> list[int]:
+    """Up to `count` of xy (n, 2), at yaws that are allowed (n, yaws) there, after each of which the
+    map of the area is known best."""
+    usable = np.flatnonzero(np.logical_or.reduce(allowed, axis=1))
+
+    def yaw(place: int) -> Array:
+        turns = [_turn(allowed[i], place if turned else 0) for i in usable]
+        return np.radians(np.array(YAWS_DEG)[turns])
+
+    chosen = choose_circles(xy[usable], yaw, *area(config), count, spacing)
+    return [int(usable[i]) for i in chosen]
 
 
 def _spread(xy: Array, allowed: Mask, count: int, spacing: float) -> list[int]:

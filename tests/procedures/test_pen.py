@@ -157,11 +157,28 @@ def test_every_planned_spot_can_be_drawn(planned):
         pen.stroke(RIG, pen.circle(RIG, spot.xy, RADIUS), spot.yaw, 0.06)
 
 
+def test_telling_spots_obey_the_same_rules(planned):
+    used = [
+        ("A", Spot(float(s.xy[0]), float(s.xy[1]), RADIUS, f"{i}")) for i, s in enumerate(planned)
+    ]
+    telling = spots.plan_spots(RIG, CONFIG, used[:20], 40, RADIUS, 0, telling=True)
+    assert len(telling) == 40
+    xy, old = np.array([s.xy for s in telling]), np.array([s.xy for s in planned[:20]])
+    gaps = np.linalg.norm(xy[:, None] - xy, axis=2) + np.eye(len(xy))
+    assert gaps.min() > 2 * RADIUS + spots.MARGIN_M
+    assert np.linalg.norm(xy[:, None] - old, axis=2).min() > 2 * RADIUS + spots.MARGIN_M
+    yaws = np.degrees([spot.yaw for spot in telling]).round()
+    assert sum(np.count_nonzero(yaws == yaw) >= 3 for yaw in np.unique(yaws)) >= 3
+    for spot in telling[:6]:
+        pen.stroke(RIG, pen.circle(RIG, spot.xy, RADIUS), spot.yaw, 0.06)
+
+
 def test_upright_spots_keep_the_drawing_posture_where_they_can():
     some = spots.plan_spots(RIG, CONFIG, [], 20, RADIUS, 1, False)
     assert np.count_nonzero([spot.yaw == 0.0 for spot in some]) >= 12
 
 
-def test_on_full_paper_there_is_no_spot():
+@pytest.mark.parametrize("telling", [False, True])
+def test_on_full_paper_there_is_no_spot(telling):
     full = [("A", Spot(0.0, 0.0, 5.0, "before", "drawn"))]
-    assert spots.plan_spots(RIG, CONFIG, full, 4, RADIUS, 0) == []
+    assert spots.plan_spots(RIG, CONFIG, full, 4, RADIUS, 0, telling=telling) == []
