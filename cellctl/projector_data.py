@@ -43,6 +43,10 @@ REACH, LEAST_REACH_PX, MOST_REACH_PX = 0.6, 8.0, 60.0
 """How far around a corner edges of the code are asked, in distances to its nearest neighbour."""
 
 
+OUTSIDE = 0.05
+"""Part of a capture's points that may be read outside the projector's picture."""
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -227,7 +231,9 @@ def _read(dataset: ProjectorSet) -> Read:
         except SolveError as error:
             read.unread.append(Rejection(name, error.message))
             continue
-        if same := [c.id for c in read.captures if _same(c, capture)]:
+        if beyond := _beyond(capture, dataset.code.size):
+            read.unread.append(Rejection(name, beyond))
+        elif same := [c.id for c in read.captures if _same(c, capture)]:
             read.unread.append(Rejection(name, f"the same pictures as view {same[0]!r}"))
         else:
             read.captures.append(capture)
@@ -252,6 +258,18 @@ def _nearest(pixels: Array) -> Array:
     apart = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(apart, np.inf)
     return np.asarray(np.minimum(apart.min(axis=1), MOST_REACH_PX / REACH))
+
+
+def _beyond(capture: Capture, size: tuple[int, int]) -> str:
+    """What is wrong when the code tells of pixels that the projector has not; else empty."""
+    outside = int((capture.projector_px > np.array(size)).any(axis=1).sum())
+    if outside <= OUTSIDE * len(capture.points):
+        return ""
+    x, y = capture.projector_px.max(axis=0)
+    return (
+        f"the code tells of projector pixels as far as ({x:.0f}, {y:.0f}), outside {size[0]}x"
+        f"{size[1]}: check projector.size and projector.pattern"
+    )
 
 
 def _same(one: Capture, other: Capture) -> bool:

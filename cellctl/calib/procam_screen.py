@@ -53,7 +53,11 @@ def screened(
         raise SolveError(
             f"the projection is {turned[0][1]} in {', '.join(c.id for c, _ in turned)}: only a "
             "negative focal length would explain it; switch off the projector's rear or ceiling "
-            "mode, and check that neither pictures nor code were flipped"
+            "mode, and check that neither pictures nor code were flipped",
+            rejected=[
+                *(r.to_dict() for r in rejected),
+                *({"id": c.id, "reason": f"the projection is {why}"} for c, why in turned),
+            ],
         )
     rejected += [
         Rejection(c.id, f"the projection is {why}; in others it is not") for c, why in turned

@@ -173,8 +173,9 @@ def turned_over(one: Capture, across: bool) -> Capture:
 @pytest.mark.parametrize(("across", "word"), [(True, "mirrored"), (False, "upside down")])
 def test_mirrored(across, word):
     seen = captures()
-    with pytest.raises(SolveError, match=f"{word}.*negative focal length"):
+    with pytest.raises(SolveError, match=f"{word}.*negative focal length") as caught:
         solve([turned_over(one, across) for one in seen])
+    assert [r["id"] for r in caught.value.details["rejected"]] == [one.id for one in seen]
     seen[2] = turned_over(seen[2], across)
     result = solve(seen)
     assert [r.id for r in result.rejected] == ["c2"]
@@ -224,18 +225,17 @@ def test_too_few_inliers():
     assert judge(result)[0] == "pass"
 
 
-@pytest.mark.parametrize("count", [3, 5])
-def test_a_mislabelled_capture(count):
+def test_a_mislabelled_capture():
     """The code of one capture with the corners of another; then with the projector moved."""
-    seen = captures(count=count)
-    other = captures(seed=9, count=count)
+    seen = captures(count=4)
+    other = captures(seed=9, count=4)
     seen[1] = replace(seen[1], projector_px=other[-1].projector_px, slopes=other[-1].slopes)
     result = solve(seen)
     assert [r.id for r in result.rejected] == ["c1"]
     assert "mislabelled" in result.rejected[0].reason
-    moved = captures(seed=1, count=count)
+    moved = captures(seed=1, count=4)
     kicked = T_PROJECTOR_CAMERA @ pose_matrix((0.0, 0.02, 0.01), (0.01, 0.0, 0.0))
-    moved[2] = captures(seed=1, count=count, T_projector_camera=kicked)[2]
+    moved[2] = captures(seed=1, count=4, T_projector_camera=kicked)[2]
     assert [r.id for r in solve(moved).rejected] == ["c2"]
 
 
@@ -244,7 +244,7 @@ def test_captures_that_are_alike():
     rng = np.random.default_rng(2)
     alike = [
         capture(f"c{i}", Scene(board_pose((0.0, 0.0, 0.1 * i), (0, 0, 0.75))), rng, 0.08, 0.02)
-        for i in range(4)
+        for i in range(3)
     ]
     try:
         reasons = judge(solve(alike))[1]

@@ -134,6 +134,15 @@ def test_the_order_of_the_pictures_is_another_one(pictures, tmp_path):
         )
 
 
+def test_a_projector_that_is_said_to_be_smaller(pictures, tmp_path):
+    """Of the same number of bits: the code tells."""
+    content = document(0, 1, 2)
+    content["projector"] = {"size": [260, 160], "pattern": PATTERN}
+    result = solve(written(pictures, tmp_path / "g", content))
+    assert result["verdict"] == "fail"
+    assert all("check projector.size" in r["reason"] for r in result["views"]["rejected"])
+
+
 def without(content: dict[str, Any], *path: Any) -> dict[str, Any]:
     inner: Any = content
     for key in path[:-1]:

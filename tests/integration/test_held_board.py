@@ -17,7 +17,7 @@ def test_held_board(tmp_path):
     """10 cm above the table as good as on it, where the table's own map would be 9 mm off. What is
     left is how far off the camera was said to hang."""
     with known_cell(tmp_path) as cell:
-        info = cell.run("projector", held=2)
+        info = cell.run("projector", columns=10, rows=6, pictures=1, held=2)
         assert (info.verdict, info.reasons) == ("pass", [])
         lit = cell.samples(info.run_id, "lit")
     assert info.result is not None
