@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.compare import gaps
 from cellctl.calib.joint import uncertainty
-from cellctl.calib.joint.observations import BoardViews, Circles, Lit, Observations
+from cellctl.calib.joint.observations import BoardViews, Circles, Lit, LitBoard, Observations
 from cellctl.calib.joint.result import JointResult
 from cellctl.calib.joint.solve import solve_joint
 from cellctl.calib.joint.uncertainty import Step
@@ -22,12 +23,15 @@ from cellctl.calib.views import RobotView
 from cellctl.config import CellConfig
 from cellctl.errors import SolveError
 from cellctl.geometry import Array
-from cellctl.procedures import hand_eye, intrinsic, refine
+from cellctl.procedures import hand_eye, intrinsic, lit_board, refine
 from cellctl.procedures.evaluate import Judged
+from cellctl.procedures.knowledge import board_of
+from cellctl.procedures.observations import journalled
 from cellctl.procedures.optical import Optical
+from cellctl.procedures.record import Record
 from cellctl.procedures.spots import area
 
-CAMERA, HAND_EYE = "intrinsic views", "hand-eye views"
+CAMERA, HAND_EYE, HELD = "intrinsic views", "hand-eye views", "held boards"
 NAMES = {CAMERA: "camera", HAND_EYE: "hand-eye"}
 """Of groups of views, as sources of error."""
 MORE = {
@@ -36,6 +40,7 @@ MORE = {
     "touches": "touch the table {n} times more",
     CAMERA: "take {n} views of the checkerboard more",
     HAND_EYE: "take {n} views of the marker board more",
+    "lit boards": "hold the marker board into the light {n} times more",
 }
 GRID, REACH = 11, 1.1
 """The map: so many places in each direction, over that part of the drawn area."""
@@ -46,7 +51,29 @@ DOZEN, LEVEL = 12, 0.05
 FEWEST = 6
 
 
-def observations(optical: Optical, touches: Array, marks: Sequence[Mark]) -> Observations:
+@dataclass(frozen=True, eq=False)
+class HeldBoard:
+    """The marker board as it was held into the light, and the light that was read on it."""
+
+    view: RobotView
+    light: Lit
+
+
+def held_boards(record: Record[Any]) -> list[HeldBoard]:
+    """Those of a projector's run, or part of a run."""
+    board, found = board_of(record.config, hand_eye.BOARD), []
+    for _, sample in sorted(record.samples(lit_board.LIT).items()):
+        view = None if sample.data["flaw"] else journalled(sample, board)
+        if isinstance(view, RobotView):
+            data = sample.data
+            light = Lit(np.array(data["projector_px"]), np.array(data["camera_px"]))
+            found.append(HeldBoard(view, light))
+    return found
+
+
+def observations(
+    optical: Optical, touches: Array, marks: Sequence[Mark], held: Sequence[HeldBoard] = ()
+) -> Observations:
     """All that a run saw; `touches` (n, 3) of the table, metres in the world."""
     rejected = {r.id for r in (*optical.camera.rejected, *optical.pose.rejected)}
     light = [
@@ -54,11 +81,15 @@ def observations(optical: Optical, touches: Array, marks: Sequence[Mark]) -> Obs
         for picture in optical.shown.pictures
         for number, pixel in picture.items()
     ]
+    views = [
+        BoardViews(CAMERA, intrinsic.BOARD, _kept(optical.checker.views, rejected)),
+        BoardViews(HAND_EYE, hand_eye.BOARD, _kept(optical.markers.views, rejected)),
+    ]
+    if held:
+        views.append(BoardViews(HELD, hand_eye.BOARD, [one.view for one in held]))
     return Observations(
-        views=[
-            BoardViews(CAMERA, intrinsic.BOARD, _kept(optical.checker.views, rejected)),
-            BoardViews(HAND_EYE, hand_eye.BOARD, _kept(optical.markers.views, rejected)),
-        ],
+        views=views,
+        lit_boards=[LitBoard(HELD, one.view.id, one.light) for one in held],
         touches=touches,
         markers=Lit(np.array([p for p, _ in light]), np.array([c for _, c in light])),
         circles=Circles.of(marks, optical.camera.camera),
@@ -69,11 +100,13 @@ def _kept(views: Sequence[RobotView], rejected: set[str]) -> list[RobotView]:
     return [view for view in views if view.id not in rejected]
 
 
-def adjusting(optical: Optical, touches: Array, base: Calibration) -> Adjust:
+def adjusting(
+    optical: Optical, touches: Array, held: Sequence[HeldBoard], base: Calibration
+) -> Adjust:
     """The joint adjustment of a run, from `base`, with those circles that agree."""
 
     def adjust(marks: Sequence[Mark]) -> JointResult:
-        return solve_joint(observations(optical, touches, marks), base)
+        return solve_joint(observations(optical, touches, marks, held), base)
 
     return adjust
 
@@ -111,8 +144,17 @@ def told(result: JointResult, points: Array) -> dict[str, Any]:
             if np.isfinite(step.rms_mm)
         ],
         "enough": _enough(steps),
+        "projector": _projector(result),
         "sigma": {name: float(sigma) for name, sigma in result.sigma.items()},
     }
+
+
+def _projector(result: JointResult) -> dict[str, Any] | None:
+    """The projector's full model in the world, once a second plane was lit."""
+    if not result.seen.lit_boards:
+        return None
+    full = result.state.full_projector
+    return {**full.lens.to_dict(), "T_world_projector": full.pose.tolist()}
 
 
 def _counts(drawn: int) -> list[int]:

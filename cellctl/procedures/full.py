@@ -156,7 +156,8 @@ def _ink(record: Record[FullParams], base: Calibration, seen: Optical) -> Ink:
     marks = found.marks(base.camera)
     slips = refine.slipped(marks, base)
     touches = measure_table.seen(record.scoped(TABLE, record.params.measure_table))
-    adjust = accuracy.adjusting(seen, np.array(list(touches.values())), base)
+    held = accuracy.held_boards(record.scoped(PROJECTOR, record.params.projector))
+    adjust = accuracy.adjusting(seen, np.array(list(touches.values())), held, base)
     try:
         result = refine.solve(marks, base, adjust)
     except SolveError as error:
