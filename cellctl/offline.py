@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from cellctl import projector_data
 from cellctl.calib import hand_eye, intrinsic
@@ -20,6 +23,7 @@ from cellctl.dataset import Dataset, load_dataset
 from cellctl.errors import BadInput, SolveError
 from cellctl.procedures.again import solve_run
 
+MIRRORED_TRIED = 3
 CAME_ALONG = IntrinsicLimits(views=3, coverage=0.0, rejected=1.0)
 """What pictures for the camera alone must reach: no more than is asked of a camera that comes
 from the hand-eye views, which show whether it is good where it counts."""
@@ -144,10 +148,21 @@ def require_board(seen: Observed[Any], dataset: Dataset, key: str) -> None:
     board = ", ".join(f"{name} {value}" for name, value in dataset.board.to_dict().items())
     told = [r for r in seen.unseen if r.reason != NOT_FOUND][:1]
     clue = "".join(f"; view {r.id!r}: {r.reason}" for r in told)
+    if _mirrored(dataset, key):
+        clue = (
+            "; seen in a mirror it is there: the pictures are mirrored, take them without flipping"
+        )
     raise BadInput(
         f"{dataset.where}: {key}: the board ({board}) is not seen in any picture; check its "
         f"type, its counts and its dictionary{clue}"
     )
+
+
+def _mirrored(dataset: Dataset, key: str) -> bool:
+    """Whether one of the first pictures shows the board when it is flipped, as markers do."""
+    pictures = dataset.images() if key == "views" else dataset.intrinsic_images()
+    first = islice(pictures, MIRRORED_TRIED)
+    return any(dataset.board.detect(np.ascontiguousarray(image[:, ::-1])) for _, image in first)
 
 
 def _judged(reasons: Sequence[str], solved: dict[str, Any]) -> dict[str, Any]:

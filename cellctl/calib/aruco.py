@@ -14,8 +14,12 @@ from cellctl.calib.corners import Grey, cross, sample
 from cellctl.errors import BadInput
 from cellctl.geometry import Array, Mask
 
-LINES = 14
-"""Profiles across each side of a marker, over its middle 70 %."""
+LINES, LINE_PX = (14, 20, 28, 38, 48), 1.5
+"""Profiles across each side of a marker: about that far apart, one of these numbers."""
+ROUNDED_PX, ROUNDED = 3.0, 0.08
+"""What blur rounds at a corner, and what of a side is left out there at least."""
+LEAST_MODULE_PX = 2.5
+"""Smaller modules leave no room for an edge's profile: corners would be off by up to 2 px."""
 STEP_PX = 0.5
 STRAY_PX = 3.0
 MINIMUM_CONTRAST = 8.0
@@ -88,23 +92,37 @@ def refine_quads(image: Grey, corners: Array, modules: int) -> tuple[Array, Mask
     `modules` is the side in modules, the black border being one wide: profiles stay within it
     and within a white margin as wide.
     """
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    refined = corners.copy()
+    clear = sides.min(axis=1, initial=np.inf) > LEAST_MODULE_PX * modules
+    wanted = 0.8 * sides.mean(axis=1) / LINE_PX
+    lines = np.array(LINES)[np.argmin(np.abs(wanted[:, None] - LINES), axis=1)]
+    for count in np.unique(lines[clear]):  # alike ones together, and no marker changes others
+        some = np.flatnonzero(clear & (lines == count))
+        refined[some], clear[some] = _refined(image, corners[some], modules, int(count))
+    return refined, clear
+
+
+def _refined(image: Grey, corners: Array, modules: int, lines: int) -> tuple[Array, Mask]:
+    """As `refine_quads`, by so many profiles across each side."""
     refined, clear = corners, np.ones(len(corners), dtype=bool)
     for _ in range(2):
-        crossings = _crossings(*_side_lines(image, refined, modules))
+        crossings = _crossings(*_side_lines(image, refined, modules, lines))
         off = np.linalg.norm(crossings - corners, axis=-1).max(axis=-1, initial=0.0)
         clear &= off < STRAY_PX
         refined = np.where(clear[:, None, None], crossings, corners)
     return refined, clear
 
 
-def _side_lines(image: Grey, corners: Array, modules: int) -> tuple[Array, Array]:
+def _side_lines(image: Grey, corners: Array, modules: int, lines: int) -> tuple[Array, Array]:
     """A point (m, 4, 2) and a direction (m, 4, 2) of the line through each side's edge."""
     along = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     along = along / np.maximum(length, 1e-9)
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
     middle = corners + 0.5 * length * along
-    places = length * np.linspace(-0.35, 0.35, LINES)
+    reach = 0.5 - np.clip(ROUNDED_PX / np.maximum(length, 1e-9), ROUNDED, 0.15)
+    places = length * reach * np.linspace(-1.0, 1.0, lines)
     feet = middle[..., None, :] + places[..., None] * along[..., None, :]
     offsets = _edge_offsets(image, feet, outward, length.min(axis=(1, 2)) / modules)
     intercept, slope = _fit_lines(places, offsets)
@@ -118,8 +136,8 @@ def _edge_offsets(image: Grey, feet: Array, outward: Array, modules: Array) -> A
     An edge of any symmetric blur lies where the area under its profile says: the integral of
     (I - dark) / (bright - dark) from -a to b is b - offset. Not-a-number where there is no edge.
     """
-    inner = np.clip(0.6 * modules, 1.5, 5.0)
-    outer = np.clip(0.75 * modules, 2.0, 5.0)
+    inner = np.clip(0.6 * modules, 1.5, 4.0)
+    outer = np.clip(0.75 * modules, 2.0, 4.0)
     count = int(np.ceil((inner + outer).max() / STEP_PX)) + 1
     steps = np.linspace(-inner, outer, count, axis=-1)[:, None, None, :, None]
     profile = sample(image, feet[..., None, :] + steps * outward[:, :, None, None, :])
@@ -143,7 +161,7 @@ def _fit_lines(x: Array, y: Array) -> tuple[Array, Array]:
         scale = np.median(np.where(weights > 0, off, 0.0), axis=-1, keepdims=True)
         weights = weights * (off <= 4.0 * scale + 0.05)
         a, b = _straight(x, y, weights)
-    enough = weights.sum(axis=-1) >= LINES / 2
+    enough = weights.sum(axis=-1) >= x.shape[-1] / 2
     return np.where(enough, a, np.nan), b
 
 

@@ -14,12 +14,16 @@ import cv2
 import numpy as np
 
 from cellctl.calib.beyond import print_goes_on
-from cellctl.calib.corners import Grey, cross, sample
+from cellctl.calib.corners import Grey, cross, grid_spacing, sample
 from cellctl.calib.printed import Unseen, lattice, neighbours
 from cellctl.calib.projector_map import apply_homography, direct_linear_transform
 from cellctl.geometry import Array
 
 STEPS = 40
+STRAY = 0.25
+"""How far a dot may be from a plane's picture, in distances between neighbours; a lens bends by
+less."""
+STRAYS = "the dots are too small or too blurred to be told apart: move the camera nearer"
 GOES_ON = "the grid goes on beyond {}x{} dots: count the board's dots"
 
 
@@ -37,9 +41,20 @@ def find_dots(image: Grey, counts: tuple[int, int]) -> Array | Unseen:
     grid = np.asarray(centres, dtype=float).reshape(counts[1], counts[0], 2)
     if cross(grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]) < 0:
         grid = grid[:, ::-1]
+    if not _flat(grid, counts):
+        return Unseen(STRAYS)
     if print_goes_on(image, grid, alternating=False):
         return Unseen(GOES_ON.format(*counts))
     return _without_perspective(image, grid.reshape(-1, 2), counts)
+
+
+def _flat(grid: Array, counts: tuple[int, int]) -> bool:
+    """Whether the dots (rows, columns, 2) lie where a plane's picture has them: the finder may
+    take something else for a dot that it misses."""
+    places, pixels = lattice(counts, 1.0)[:, :2], grid.reshape(-1, 2)
+    H = direct_linear_transform(places, pixels)
+    off = np.linalg.norm(apply_homography(H, places) - pixels, axis=1)
+    return bool(off.max() < STRAY * grid_spacing(grid))
 
 
 @cache

@@ -201,7 +201,7 @@ def test_pictures_without_the_board_count_in_the_verdict(pictures):
     content = document(images=("0", "1", "2", "3"))
     content["views"] += blanks
     result = solve_dataset(write(pictures, content))
-    assert "3 of 7 views were rejected" in result["reasons"]
+    assert any(r.startswith("3 of 7 views were rejected") for r in result["reasons"])
 
 
 def turned(name: str, degrees: float) -> dict[str, Any]:

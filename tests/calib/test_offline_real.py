@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -70,7 +71,9 @@ def test_shuffled_and_mislabelled(shared_data, tmp_path):
     shuffled = solve_dataset(copied(source, tmp_path / "shuffled", lambda d: d["views"].reverse()))
     assert json.dumps(plain) == json.dumps(shuffled)
     swapped = solve_dataset(copied(source, tmp_path / "swapped", swap))
-    assert {"02", "05"} <= {r["id"] for r in swapped["views"]["rejected"]}
+    reasons = {r["id"]: r["reason"] for r in swapped["views"]["rejected"]}
+    assert "exchanging the poses of views '02' and '05' would fit" in reasons["02"]
+    assert "exchanging the poses of views '05' and '02' would fit" in reasons["05"]
     apart = np.array(swapped["T_flange_camera"]) - np.array(plain["T_flange_camera"])
     assert np.linalg.norm(apart[:3, 3]) < 5e-3
 
@@ -110,17 +113,68 @@ def test_copies_of_pictures_change_nothing(shared_data, tmp_path):
     }
 
 
+def test_a_board_stated_wrong_is_bad_input(shared_data, tmp_path):
+    wrong = {"inner_corners": [8, 6]}
+    source = shared_data / "opencv_left_intr"
+    folder = copied(source, tmp_path, lambda d: d["board"].update(wrong))
+    with pytest.raises(
+        BadInput, match=r"not seen in any picture.*goes on beyond 8x6 inner corners"
+    ):
+        solve_dataset(folder)
+
+
+def test_the_other_pattern_is_a_failed_verdict(shared_data, tmp_path):
+    source = shared_data / "ur_charuco_eih"
+    folder = copied(source, tmp_path, lambda d: d["board"].update(legacy=True))
+    result = solve_dataset(folder)
+    assert result["verdict"] == "fail"
+    assert "legacy is stated wrong; state the other value" in result["reasons"][0]
+    assert len(result["views"]["rejected"]) == 7
+    assert all("legacy" in view["reason"] for view in result["views"]["rejected"])
+
+
+def test_mirrored_markers_are_named(shared_data, tmp_path):
+    source = shared_data / "ur_charuco_eih"
+    document = json.loads((source / "dataset.json").read_text())
+    for view in document["views"]:
+        image = cv2.imread(str(source / view["image"]), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(tmp_path / f"{view['id']}.png"), image[:, ::-1])
+        view["image"] = f"{view['id']}.png"
+    (tmp_path / "dataset.json").write_text(json.dumps(document))
+    with pytest.raises(BadInput, match="the pictures are mirrored"):
+        solve_dataset(tmp_path)
+
+
+def shifted(document: Any) -> None:
+    poses = [view["T_base_flange"] for view in document["views"]]
+    for view, pose in zip(document["views"], [*poses[1:], poses[0]], strict=True):
+        view["T_base_flange"] = pose
+
+
+def inverted(document: Any) -> None:
+    for view in document["views"]:
+        view["T_base_flange"] = np.linalg.inv(view["T_base_flange"]).tolist()
+
+
+def other_mount(document: Any) -> None:
+    mounts = ("eye-to-hand", "eye-in-hand")
+    document["mount"] = mounts[1 - mounts.index(document["mount"])]
+
+
+@pytest.mark.parametrize("name", ["rct_charuco_e2h", "ur_charuco_eih"])
 @pytest.mark.parametrize(
-    ("name", "wrong", "words"),
+    ("plant", "words"),
     [
-        ("opencv_left_intr", {"inner_corners": [8, 6]}, "goes on beyond 8x6 inner corners"),
-        ("ur_charuco_eih", {"legacy": True}, "legacy is stated wrong"),
+        (shifted, "shifted by one"),
+        (inverted, "the poses are inverted"),
+        (other_mount, "the mount is"),
     ],
 )
-def test_a_board_stated_wrong_is_bad_input(shared_data, tmp_path, name, wrong, words):
-    folder = copied(shared_data / name, tmp_path, lambda d: d["board"].update(wrong))
-    with pytest.raises(BadInput, match=f"not seen in any picture.*{words}"):
-        solve_dataset(folder)
+def test_what_is_wrong_with_real_poses_is_named(shared_data, tmp_path, name, plant, words):
+    result = solve_dataset(copied(shared_data / name, tmp_path, plant))
+    assert result["verdict"] == "fail"
+    assert any(words in reason for reason in result["reasons"])
 
 
 def test_a_board_of_another_size_fails_and_says_so(shared_data, tmp_path):
