@@ -11,7 +11,7 @@ good as it can be, and collecting may stop anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -100,34 +100,28 @@ def circle_rows(xy: Array, yaw: Array, low: Array, high: Array) -> Array:
     return rows / MARK_SIGMA_MM
 
 
-def choose_circles(
-    xy: Array,
-    yaw: Callable[[int], Array],
-    low: Array,
-    high: Array,
-    count: int,
-    spacing: float,
-) -> list[int]:
+def choose_circles(xy: Array, low: Array, high: Array, count: int, spacing: float) -> list[int]:
     """Up to `count` of the places xy (n, 2), metres, best first, in the area from `low` to `high`.
 
-    `yaw(k)` are the tool's turns (n,), rad, at which the k-th circle would be drawn at each. No two
-    lie nearer than `spacing` metres; and as long as there is room none nearer than APART of the
+    The tool's yaw is left to the caller: a choice that looked at it would take places where the
+    tool cannot be turned, since there the pen's offset does no harm, and would never learn it. No
+    two lie nearer than `spacing` metres; and as long as there is room none nearer than APART of the
     side of the square that is each circle's share of the area: the smooth map is only a model, and
     circles far apart show where it is not right.
     """
     beyond = (BEYOND - 1.0) / 2 * (high - low)
     design = circle_design(Area(low - beyond, high + beyond).grid(), low, high)
     share = APART * float(np.sqrt(np.prod(high - low) / max(count, 1)))
+    rows = circle_rows(xy, np.zeros(len(xy)), low, high)
     away, chosen = np.full(len(xy), np.inf), list[int]()
     while len(chosen) < count and (away >= spacing).any():
         apart = away >= max(share, spacing)
         free = np.flatnonzero(apart if apart.any() else away >= spacing)
-        rows = circle_rows(xy[free], yaw(len(chosen))[free], low, high)
-        best = int(np.argmax(design.gains(rows)))
+        best = free[int(np.argmax(design.gains(rows[free])))]
         design.add(rows[best])
-        chosen.append(int(free[best]))
-        away = np.minimum(away, np.linalg.norm(xy - xy[free[best]], axis=1))
-        away[free[best]] = -np.inf
+        chosen.append(int(best))
+        away = np.minimum(away, np.linalg.norm(xy - xy[best], axis=1))
+        away[best] = -np.inf
     return chosen
 
 

@@ -91,10 +91,11 @@ def plan_spots(
         return []
     allowed, above = _postures(rig, xy, radius)
     spacing = 2 * radius + MARGIN_M
+    usable = np.logical_or.reduce(allowed, axis=1)
     if telling:
-        chosen = _telling(config, xy, allowed, count, spacing, turned)
+        chosen = _telling(config, xy, usable, count, spacing)
     else:
-        chosen = _spread(xy, np.logical_or.reduce(allowed, axis=1), count, spacing)
+        chosen = _spread(xy, usable, count, spacing)
     spots = []
     for place, i in enumerate(chosen):
         turn = _turn(allowed[i], place if turned else 0)
@@ -154,18 +155,10 @@ def _turn(allowed: Mask, place: int) -> int:
     return next(k % turns for k in range(place, place + turns) if allowed[k % turns])
 
 
-def _telling(
-    config: CellConfig, xy: Array, allowed: Mask, count: int, spacing: float, turned: bool
-) -> list[int]:
-    """Up to `count` of xy (n, 2), at yaws that are allowed (n, yaws) there, after each of which the
-    map of the area is known best."""
-    usable = np.flatnonzero(np.logical_or.reduce(allowed, axis=1))
-
-    def yaw(place: int) -> Array:
-        turns = [_turn(allowed[i], place if turned else 0) for i in usable]
-        return np.radians(np.array(YAWS_DEG)[turns])
-
-    chosen = choose_circles(xy[usable], yaw, *area(config), count, spacing)
+def _telling(config: CellConfig, xy: Array, allowed: Mask, count: int, spacing: float) -> list[int]:
+    """Up to `count` of xy (n, 2), after each of which the map of the area is known best."""
+    usable = np.flatnonzero(allowed)
+    chosen = choose_circles(xy[usable], *area(config), count, spacing)
     return [int(usable[i]) for i in chosen]
 
 

@@ -112,8 +112,7 @@ def chosen_spots(cell: DrawnCell, count: int, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     share = rng.uniform(0.0, 1.0, (400, 2))
     xy = low + np.where(rng.uniform(size=share.shape) < 0.3, np.round(share), share) * (high - low)
-    yaws = [np.full(len(xy), yaw) for yaw in YAWS]
-    return xy[choose_circles(xy, lambda k: yaws[k % 3], low, high, count, 0.03)]
+    return xy[choose_circles(xy, low, high, count, 0.03)]
 
 
 def predicted(cell: DrawnCell, xy: Array) -> float:
@@ -162,9 +161,9 @@ def test_chosen_spots_keep_their_distance(cells):
     gaps = np.linalg.norm(xy[:, None] - xy, axis=2) + np.eye(24)
     low, high = area(cells[0])
     assert gaps.min() >= APART * np.sqrt(np.prod(high - low) / 24)
-    crowded = choose_circles(xy, lambda _: np.zeros(24), low, high, 24, 0.03)
+    crowded = choose_circles(xy, low, high, 24, 0.03)
     assert sorted(crowded) == list(range(24))
-    assert len(choose_circles(xy, lambda _: np.zeros(24), low, high, 24, 0.3)) < 8
+    assert len(choose_circles(xy, low, high, 24, 0.3)) < 8
 
 
 def test_the_expected_error_is_the_actual_one(cells):
