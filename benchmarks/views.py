@@ -28,7 +28,7 @@ from."""
 def planned(truth: Truth, name: str, count: int, rng: Rng) -> list[Array]:
     """Joints (6,) of the nominal arm for about 2 `count` views of a board, spread out, the most
     extreme first."""
-    rig = _rig(truth, name)
+    rig = rig_of(truth, name)
     spread = SPREADS[truth.preset.name, name]
     poses = candidates(rig, spread, CANDIDATES * count, int(rng.integers(2**31)))
     flanges = rig.flange(poses)
@@ -46,7 +46,7 @@ def planned(truth: Truth, name: str, count: int, rng: Rng) -> list[Array]:
     return [view.joints for view in chosen[: 2 * count]]
 
 
-def _rig(truth: Truth, name: str) -> Rig:
+def rig_of(truth: Truth, name: str) -> Rig:
     """As the search for the board finds it, to better than matters here."""
     lens, board = truth.camera.lens, truth.boards[name]
     vector = np.array([*lens.focal, *lens.centre, *lens.distortion])

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from cellctl.calib.design import greedy
+from cellctl.calib.pose_design import view_design, view_rows
 from cellctl.geometry import Array, invert
 from cellctl.procedures.rig import PlannedView, Rig
 
 SUBSETS = 2000
 DEPTH_WEIGHT = 0.3
+GRID = 4
+"""Points of a board, each way, that stand for its corners."""
 RIDGE = 1e-9
 """Keeps the place of motions about parallel axes finite."""
 
@@ -45,6 +49,19 @@ def features(rig: Rig, poses: Array) -> Array:
             np.log(points[..., 2].mean(axis=1)),
         ]
     )
+
+
+def most_telling(
+    rig: Rig, views: list[PlannedView], count: int, places: Array
+) -> list[PlannedView]:
+    """Up to `count` of `views`, best first: after each, hand-eye's pose of the camera is known best
+    for what it is needed for, where the camera sees world places (g, 3) of the table."""
+    if not views:
+        return []
+    poses = np.array([view.T_camera_board for view in views])
+    flat = rig.board_points(np.eye(4)[None], GRID)[0]
+    rows = view_rows(flat, poses, rig.T_flange_board, float(rig.camera.K[0, 0]))
+    return [views[i] for i in greedy(view_design(places, rig.T_world_camera), rows, count)]
 
 
 def about_camera(views: list[PlannedView], count: int, seed: int) -> list[PlannedView]:

@@ -173,9 +173,8 @@ def test_telling_spots_obey_the_same_rules(planned):
 
 
 def drawable(spot):
-    stroke = pen.stroke(RIG, pen.circle(RIG, spot.xy, RADIUS), spot.yaw, 0.06)
     try:
-        GUARD.check_stroke(stroke)
+        pen.stroke(RIG, pen.circle(RIG, spot.xy, RADIUS), spot.yaw, 0.06)
     except MotionRefused:
         return False
     return True
