@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
-	format-fix soak-kill soak-faults soak-demo soak-core bench-render bench-solvers
+	format-fix soak-kill soak-faults soak-demo soak-core bench-render bench-solvers bench-accuracy
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -61,6 +61,9 @@ soak-core: install ## Kill the engine with a toy procedure KILLS times
 
 bench-render: install ## Milliseconds a rendered picture
 	$(BIN)/python -m benchmarks.render
+
+bench-accuracy: install ## True errors on SEEDS beside the published pipeline, nothing rendered
+	$(BIN)/python -m benchmarks.accuracy --seeds $(SEEDS)
 
 bench-solvers: install ## The adjustments against OpenCV and SciPy
 	$(BIN)/python -m benchmarks.solvers

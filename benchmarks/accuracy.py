@@ -74,7 +74,7 @@ def measure(case: Case, layouts: list[str]) -> Outcome:
 
 def _ours(found: World, rounds: int, repeats: int) -> tuple[float, str]:
     base = found.drawing.base
-    result = refine.solve(found.circles(found.spots(rounds, repeats)), base)
+    result = refine.solve(found.circles(found.spots(rounds, repeats)), base, found.adjust)
     return found.drawing.score(refine.refined(base, result)), result.chosen
 
 

@@ -6,6 +6,7 @@ records, and nothing of the truth, to the solvers that a run hands them to.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,9 @@ from benchmarks.views import planned
 from cellctl.calib.calibration import Calibration
 from cellctl.calib.hand_eye import solve_hand_eye
 from cellctl.calib.intrinsic import solve_intrinsic
+from cellctl.calib.joint.observations import BoardViews, Circles, Lit, Observations
+from cellctl.calib.joint.result import JointResult
+from cellctl.calib.joint.solve import solve_joint
 from cellctl.calib.projector import LensPrior, solve_projector
 from cellctl.calib.refine_fit import Mark
 from cellctl.calib.table import solve_table
@@ -48,16 +52,32 @@ def planted(preset: Preset, plant: str | None) -> Preset:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """`seen`: boards and projected markers; `drawing`: the pen, and who scores. `rng` makes the
-    noise of what is drawn and touched."""
+    """`seen`: boards and projected markers; `drawing`: the pen, and who scores; `touched` (n, 3) of
+    the table. `rng` makes the noise of what is drawn and touched."""
 
     seen: NumericCell
     drawing: DrawnCell
+    touched: Array
     rng: np.random.Generator
 
     def circles(self, xy: Array, yaws: Array | None = None) -> list[Mark]:
         """Drawn at xy (n, 2), seen by the solved camera."""
         return self.drawing.marks(xy, self.rng, yaws)
+
+    def adjust(self, marks: Sequence[Mark]) -> JointResult:
+        """Everything that was seen, adjusted together."""
+        seen, base = self.seen, self.drawing.base
+        light = [(seen.centres[i], place) for p in seen.pictures for i, place in p.items()]
+        observations = Observations(
+            views=[
+                BoardViews("intrinsic views", "checkerboard", seen.intrinsic),
+                BoardViews("hand-eye views", "markers", seen.hand_eye),
+            ],
+            touches=self.touched,
+            markers=Lit(np.array([p for p, _ in light]), np.array([c for _, c in light])),
+            circles=Circles.of(marks, base.camera),
+        )
+        return solve_joint(observations, base)
 
     def pictured(self, xy: Array) -> Array:
         """Camera pixels (n, 2) of circles drawn at xy (n, 2) in the drawing posture."""
@@ -87,8 +107,9 @@ def world(cell: str, seed: int, plant: str | None = None) -> World:
     """A cell of that seed, its boards and markers seen and solved, its table touched."""
     seen = numeric_cell(seed, preset=planted(PRESETS[cell], plant), poser=planned)
     rng = np.random.default_rng([seed, 55])
-    base = solved(seen, touches(seen, rng))
-    return World(seen, DrawnCell(seen.truth, base, seen.known), rng)
+    touched = touches(seen, rng)
+    base = solved(seen, touched)
+    return World(seen, DrawnCell(seen.truth, base, seen.known), touched, rng)
 
 
 def solved(seen: NumericCell, touched: Array) -> Calibration:
