@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from tests.calib.numeric_cell import HOME, numeric_cell
 
 PERFECT = replace(CR.arm_errors, zero_sigma_deg=0.0, length_sigma_m=0.0, twist_sigma_deg=0.0)
 """An arm that only repeats badly: what kinematics are off by is the same for any choice."""
-SEEDS, FEW, MANY = 4, 9, 18
+SEEDS, FEW, MANY = 8, 9, 18
 
 
 def reachable(truth: Truth, rig: Rig, rng: np.random.Generator) -> list[PlannedView]:
@@ -59,15 +60,19 @@ def hand_eye_mm(seed: int, count: int, poser) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.square(gap * true[:, 2:]).sum(axis=1))))
 
 
+@pytest.mark.skipif("CELLCTL_SOAK" not in os.environ, reason="a minute; set CELLCTL_SOAK")
 def test_nine_chosen_views_are_worth_eighteen_of_chance():
+    """Of eight cells: 0.080 mm, 0.070 by 18 views of chance, 0.098 by 9 of them."""
     few = [hand_eye_mm(seed, FEW, chosen) for seed in range(SEEDS)]
     many = [hand_eye_mm(seed, MANY, by_chance) for seed in range(SEEDS)]
-    assert np.sqrt(np.mean(np.square(few))) < 1.15 * np.sqrt(np.mean(np.square(many)))
+    assert np.sqrt(np.mean(np.square(few))) < 1.2 * np.sqrt(np.mean(np.square(many)))
 
 
-def test_they_are_predicted_to_be_better_than_any_of_chance():
-    truth = draw(CR, 0)
-    rig, rng = rig_of(truth, "markers"), np.random.default_rng(0)
+@pytest.mark.parametrize("seed", range(3))
+def test_nine_are_predicted_to_be_worth_twelve_of_chance(seed):
+    """Of candidates that are all tilted well already."""
+    truth = draw(CR, seed)
+    rig, rng = rig_of(truth, "markers"), np.random.default_rng(seed)
     views = reachable(truth, rig, rng)
 
     def predicted(some: list[PlannedView]) -> float:
@@ -78,9 +83,13 @@ def test_they_are_predicted_to_be_better_than_any_of_chance():
             design.add(row)
         return design.error
 
+    def chance(count: int) -> list[float]:
+        orders = [rng.permutation(len(views))[:count] for _ in range(30)]
+        return [predicted([views[i] for i in order]) for order in orders]
+
     best = most_telling(rig, views, FEW, table(truth))
-    chance = [predicted([views[i] for i in rng.permutation(len(views))[:FEW]]) for _ in range(30)]
-    assert predicted(best) < min(chance)
+    assert predicted(best) < min(chance(FEW))
+    assert predicted(best) < np.median(chance(12))
     assert predicted(best[: FEW // 2]) > predicted(best)
     assert most_telling(rig, [], 5, table(truth)) == []
 
