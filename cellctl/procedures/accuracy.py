@@ -154,7 +154,12 @@ def _projector(result: JointResult) -> dict[str, Any] | None:
     if not result.seen.lit_boards:
         return None
     full = result.state.full_projector
-    return {**full.lens.to_dict(), "T_world_projector": full.pose.tolist()}
+    lens = full.lens.to_dict()
+    return {
+        "K": lens["K"],
+        "distortion": lens["distortion"],
+        "T_world_projector": full.pose.tolist(),
+    }
 
 
 def _counts(drawn: int) -> list[int]:

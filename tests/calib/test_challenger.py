@@ -128,4 +128,4 @@ def test_another_must_be_better_beyond_chance(cell, marks):
     assert "mm by the circles alone, without hand-eye" in why
     alone, why = choose([challenger])
     assert alone is challenger
-    assert why == "nothing else was tried"
+    assert why.endswith("mm by the circles alone, without hand-eye")
