@@ -14,7 +14,11 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
+<<<<<<< HEAD
 	format-fix soak-kill soak-faults soak-demo soak-core bench-render bench-solvers bench-accuracy
+=======
+	format-fix soak-kill soak-faults soak-demo soak-core bench-accuracy bench-render
+>>>>>>> challenge
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -58,6 +62,9 @@ soak-demo: install ## The demo of CELLS on SEEDS: verdicts, true errors, rows be
 
 soak-core: install ## Kill the engine with a toy procedure KILLS times
 	CELLCTL_SOAK=$(KILLS) $(BIN)/pytest tests/core/test_crash.py
+
+bench-accuracy: install ## True millimetres in the standard worlds, the published pipeline beside ours
+	$(BIN)/python -m benchmarks.accuracy --jobs $(JOBS)
 
 bench-render: install ## Milliseconds a rendered picture
 	$(BIN)/python -m benchmarks.render
