@@ -14,11 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
-<<<<<<< HEAD
-	format-fix soak-kill soak-faults soak-demo soak-core bench-render bench-solvers bench-accuracy
-=======
-	format-fix soak-kill soak-faults soak-demo soak-core bench-accuracy bench-render
->>>>>>> challenge
+	format-fix soak-kill soak-faults soak-demo soak-core bench-accuracy bench-render bench-solvers
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -68,9 +64,6 @@ bench-accuracy: install ## True millimetres in the standard worlds, the publishe
 
 bench-render: install ## Milliseconds a rendered picture
 	$(BIN)/python -m benchmarks.render
-
-bench-accuracy: install ## True errors on SEEDS beside the published pipeline, nothing rendered
-	$(BIN)/python -m benchmarks.accuracy --seeds $(SEEDS)
 
 bench-solvers: install ## The adjustments against OpenCV and SciPy
 	$(BIN)/python -m benchmarks.solvers
