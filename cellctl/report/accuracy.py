@@ -20,6 +20,8 @@ TITLE = "What error to expect, and why"
 WIDTH, HEIGHT = 420.0, 280.0
 FAINTEST, STRONGEST = 0.06, 0.9
 BAR, NAMES = 22.0, 110.0
+LEAST = 0.001
+"""Millimetres that are worth a figure."""
 CURVES = (("predicted_mm", "train", "predicted"), ("held_out_mm", "held", "held out"))
 LEGEND = (
     ("dot train", "predicted"),
@@ -127,8 +129,12 @@ def _bars(shares: list[tuple[str, float]]) -> Markup:
         top, length = BAR * i + 4, (WIDTH - NAMES - 60) * value / largest
         svg.text((NAMES - 8, top + 13), name, "label", "end")
         svg.box((NAMES, top + 2), (NAMES + max(length, 1.0), top + BAR - 5), "bar train", rx=2)
-        svg.text((NAMES + length + 6, top + 13), figure(value), "tick")
+        svg.text((NAMES + length + 6, top + 13), _told(value), "tick")
     return svg.markup()
+
+
+def _told(value: float) -> str:
+    return figure(value) if value >= LEAST else f"under {LEAST}"
 
 
 def _next(part: dict[str, Any]) -> list[Block]:
