@@ -154,6 +154,8 @@ def interval(values: Array) -> tuple[float, float]:
     """Of the median, at 95 %, whatever the distribution: order statistics (David and Nagaraja,
     Order statistics, 2003, section 7.1)."""
     count = len(values)
+    if count < 6:  # not even the extremes hold it that surely
+        return 0.0, float("inf")
     skipped = max(int(binom.ppf(0.025, count, 0.5)) - 1, 0)
     ordered = np.sort(values)
     return float(ordered[skipped]), float(ordered[count - 1 - skipped])
