@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export OMP_NUM_THREADS = 1
 
 .PHONY: help install demo test format lint types imports unit clean \
-	format-fix soak-kill soak-faults soak-demo soak-core bench-accuracy bench-render bench-solvers
+	format-fix soak-tests soak-kill soak-faults soak-demo soak-core bench-accuracy bench-render bench-solvers
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -46,6 +46,9 @@ imports: install
 
 unit: install
 	$(BIN)/pytest -n $(JOBS) --dist loadfile
+
+soak-tests: install ## The tests that `make test` leaves out because they take long
+	CELLCTL_SOAK=$(KILLS) $(BIN)/pytest -n $(JOBS) --dist loadfile
 
 soak-kill: install ## SIGKILL the daemon at KILLS random instants, resume, compare
 	$(BIN)/python -m tests.soak.kill --kills $(KILLS) --seed $(SEED)

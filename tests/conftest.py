@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import structlog
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -38,6 +39,23 @@ def no_leaks() -> Iterator[None]:
     while (left := _leaked(threads, children)) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not left, f"left behind by the test: {', '.join(left)}"
+
+
+@pytest.fixture(autouse=True)
+def logs_go_where_they_went_before() -> Iterator[None]:
+    """A command that ran in this process has sent them to a stream that ends with its test."""
+    yield
+    structlog.reset_defaults()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests marked `long` are for `make soak-tests`."""
+    if "CELLCTL_SOAK" in os.environ:
+        return
+    skip = pytest.mark.skip(reason="takes long; runs in `make soak-tests`")
+    for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(skip)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -38,11 +38,13 @@ def place(world: World, point: Array, rotation: Array) -> float:
     above[:3, 3] -= ABOVE_M * rotation[:, 2]
     undo = np.linalg.inv(pose_matrix(slip[3:], slip[:3]))
     here = world.arm.read(world.now).joints
-    lifted = _lifted(world, here)
+    lifted, home = _lifted(world, here), np.radians(truth.preset.home_deg)
     for over in _reached(world, above @ undo, here, f"above {_named(point)}"):
         down = _reached(world, target @ undo, over, _named(point))[0]
-        if world.arm.is_clear(np.array([*(lifted or [here]), over, down])):
-            return world.arm.place(world.now, np.array([*lifted, over, down]), SLOWLY, slip)
+        for by in ([], [home]):
+            if world.arm.is_clear(np.array([*(lifted or [here]), *by, over, down])):
+                way = np.array([*lifted, *by, over, down])
+                return world.arm.place(world.now, way, SLOWLY, slip)
     raise MotionRefused(f"on every way to {_named(point)} the arm would touch something")
 
 

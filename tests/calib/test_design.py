@@ -133,7 +133,7 @@ def cells() -> list[DrawnCell]:
     return [quick_cell(seed) for seed in range(SEEDS)]
 
 
-@pytest.mark.parametrize("count", [24, 60])
+@pytest.mark.parametrize("count", [24, pytest.param(60, marks=pytest.mark.long)])
 def test_chosen_spots_are_no_worse_than_jittered_ones(cells, count):
     """In prediction, and, as far as so few draws can tell, in true millimetres: of 48 draws on
     cells of either kind 60 chosen spots had 0.094 and 0.080 mm, jittered ones 0.096 and 0.084, the

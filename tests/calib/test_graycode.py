@@ -91,7 +91,9 @@ CODES = {
 }
 
 
-@pytest.mark.parametrize("name", CODES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n == "opencv" else [pytest.mark.long]) for n in CODES]
+)
 def test_edges_are_where_they_are(name):
     """On a tilted, printed board in a camera with a lens: each edge to a fraction of a pixel."""
     scene, code = Scene(POSES[1], wall=None), CODES[name]

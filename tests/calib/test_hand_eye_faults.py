@@ -157,7 +157,15 @@ def test_single_views_that_do_not_belong_are_explained(mount):
     assert np.linalg.norm(result.camera_pose.translation - X[:3, 3]) < 3e-3
 
 
-@pytest.mark.parametrize("scale", [0.5, 0.8, 1.06, 2.0])
+@pytest.mark.parametrize(
+    "scale",
+    [
+        0.5,
+        pytest.param(0.8, marks=pytest.mark.long),
+        1.06,
+        pytest.param(2.0, marks=pytest.mark.long),
+    ],
+)
 def test_another_board_is_measured_and_costs_no_view(scale):
     seen = [replace(v, points=v.points / scale) for v in robot_views(3, count=9)]
     result = solve_hand_eye(seen, "eye-to-hand", image_size=CAMERA.image_size)
@@ -191,7 +199,10 @@ def moving(views: Views, share: Array) -> Views:
     return with_poses(views, [p @ o for p, o in zip(poses_of(views), off, strict=True)])
 
 
-@pytest.mark.parametrize(("mount", "slips"), [("eye-to-hand", False), ("eye-in-hand", True)])
+@pytest.mark.parametrize(
+    ("mount", "slips"),
+    [("eye-to-hand", False), pytest.param("eye-in-hand", True, marks=pytest.mark.long)],
+)
 def test_drift_is_named_with_the_view_where_it_begins(mount, slips):
     seen = robot_views(1004, mount, count=12, robot=(0.2e-3, 0.02))
     i = np.arange(12)

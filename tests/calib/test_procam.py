@@ -86,6 +86,7 @@ def test_truth_is_recovered(good):
     assert good.noise.camera == pytest.approx(0.08, rel=0.25)
 
 
+@pytest.mark.long
 def test_the_order_does_not_matter(good):
     again = solve(captures()[::-1])
     assert np.array_equal(again.projector.vector, good.projector.vector)
@@ -104,6 +105,7 @@ def test_three_captures_and_two():
         solve(captures(count=1))
 
 
+@pytest.mark.long
 def test_a_bent_board_is_noticed():
     rng, bent = np.random.default_rng(3), []
     warp = np.array([0.0012, -0.0009, 0.0005])
@@ -183,6 +185,7 @@ def test_mirrored(across, word):
     assert judge(result)[0] == "pass"
 
 
+@pytest.mark.long
 def test_half_a_turn_is_remarked():
     upside_down = [turned_over(turned_over(one, True), False) for one in captures()]
     result = solve(upside_down)
@@ -239,6 +242,7 @@ def test_a_mislabelled_capture():
     assert [r.id for r in solve(moved).rejected] == ["c2"]
 
 
+@pytest.mark.long
 def test_captures_that_are_alike():
     """The board always faces the camera: the focal lengths are not known, and that is said."""
     rng = np.random.default_rng(2)

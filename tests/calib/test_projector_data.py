@@ -113,6 +113,7 @@ def test_bad_captures_are_named(pictures, tmp_path):
     assert result["held_out_used_px"] < 0.2
 
 
+@pytest.mark.long
 def test_the_order_of_the_pictures_is_another_one(pictures, tmp_path):
     """Than stated: no answer, and why in every view."""
     content = document(0, 1, 2)
@@ -134,6 +135,7 @@ def test_the_order_of_the_pictures_is_another_one(pictures, tmp_path):
         )
 
 
+@pytest.mark.long
 def test_a_projector_that_is_said_to_be_smaller(pictures, tmp_path):
     """Of the same number of bits: the code tells."""
     content = document(0, 1, 2)

@@ -54,8 +54,8 @@ def test_it_draws_and_proves_it(cell):
     assert_apart(spots)
 
 
-def test_a_table_that_is_not_known_well_enough_is_not_drawn_on(paper):
-    paper.promote(BOWED)
-    refused = paper.run("draw", **DRAW)
+def test_a_table_that_is_not_known_well_enough_is_not_drawn_on(cell):
+    cell.promote(BOWED)
+    refused = cell.run("draw", **DRAW)
     assert refused.status == "failed"
     assert "together more than half of the 5.0 mm that the pen holder gives way" in refused.error

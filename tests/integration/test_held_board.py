@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from cellctl.calib.camera import CameraModel
 from cellctl.geometry import Transform
@@ -13,6 +14,7 @@ from tests.integration.known_cell import CAMERA_OFF_M, known_cell
 MM_PER_PX = 0.43
 
 
+@pytest.mark.long
 def test_held_board(tmp_path):
     """10 cm above the table as good as on it, where the table's own map would be 9 mm off. What is
     left is how far off the camera was said to hang."""

@@ -60,6 +60,7 @@ def test_pen_that_runs_dry_is_named(paper):
     assert any(reason.startswith(dry) for reason in drawing.reasons), drawing.reasons
 
 
+@pytest.mark.long
 def test_pen_that_is_mounted_off_is_named(paper):
     paper.plant("pen.off", shift_mm=[6.0, 0.0, 0.0])
     drawing, refined = faulty(paper)
@@ -70,6 +71,7 @@ def test_pen_that_is_mounted_off_is_named(paper):
     assert drawing.reasons == []
 
 
+@pytest.mark.long
 def test_circles_of_a_wrong_radius_are_named(paper):
     paper.plant("drawing.shrink", factor=0.8)
     drawing, _ = faulty(paper)
@@ -78,6 +80,7 @@ def test_circles_of_a_wrong_radius_are_named(paper):
     assert any("circles come out with a radius of" in r for r in drawing.reasons), drawing.reasons
 
 
+@pytest.mark.long
 def test_circles_that_are_half_drawn_are_left_out(paper):
     paper.plant("pen.weak", share=0.5, count=2, after_strokes=paper.strokes + 5)
     drawing = paper.run("draw", **DRAW)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.integration.known_cell import KNOWN, known_cell
 
 
+@pytest.mark.long
 def test_drawing_ends_with_the_round_that_is_good_enough(tmp_path):
     """0.5 mm is to be had by twelve circles; three rounds would be allowed."""
     with known_cell(tmp_path) as cell:
