@@ -118,7 +118,7 @@ def base_of(record: Record[FullParams]) -> Calibration | None:
     except SolveError:  # the end of the run tells why
         return None
     table = _table(record)
-    failed = any(seen.judged(record.params).values())
+    failed = any(seen.judged(record.params, record.config).values())
     if failed or measure_table.judge(table, record.params.measure_table)[1]:
         return None
     return seen.calibration(table.plane).on(table)
@@ -174,7 +174,7 @@ def conclude(record: Record[FullParams]) -> Result:
         return Result.unsolved("full", error)
     table = _table(record)
     stages = seen.stages(record.config)
-    reasons = dict(seen.judged(params))
+    reasons = dict(seen.judged(params, record.config))
     reasons[TABLE] = measure_table.judge(table, params.measure_table)[1]
     best = seen.calibration(table.plane).on(table)
     data: dict[str, Any] = {

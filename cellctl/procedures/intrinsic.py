@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from cellctl.calib import intrinsic
@@ -12,13 +13,15 @@ from cellctl.errors import SolveError
 from cellctl.procedures import sweep
 from cellctl.procedures.belief import Belief
 from cellctl.procedures.capture import CaptureLimits
-from cellctl.procedures.knowledge import board_of, known
+from cellctl.procedures.knowledge import board_of, factory_camera, known
 from cellctl.procedures.observations import Collected, collected
+from cellctl.procedures.parking import lit_area
 from cellctl.procedures.planning import Spread
 from cellctl.procedures.record import Record, recorded
 from cellctl.run import Procedure, Result, Run
 
 BOARD = "checkerboard"
+COVERAGE_OF_LIGHT = 2.0
 SPREAD = Spread(fill=(0.2, 0.5), spin_deg=25.0, to_the_edges=True)
 
 
@@ -57,14 +60,27 @@ def solve(views: Collected) -> IntrinsicResult:
     )
 
 
-def judge(result: IntrinsicResult, params: IntrinsicParams) -> tuple[str, tuple[str, ...]]:
+def judge(
+    result: IntrinsicResult, params: IntrinsicParams, config: CellConfig
+) -> tuple[str, tuple[str, ...]]:
     """Pass or fail, with reasons."""
-    return intrinsic.judge(
-        result,
-        intrinsic.IntrinsicLimits(
-            views=max(6, params.views // 2), held_out_px=params.max_held_out_px
-        ),
+    limits = intrinsic.IntrinsicLimits(
+        views=max(6, params.views // 2),
+        held_out_px=params.max_held_out_px,
+        coverage=needed_coverage(config),
     )
+    return intrinsic.judge(result, limits)
+
+
+def needed_coverage(config: CellConfig) -> float:
+    """Which part of the picture the views must cover: COVERAGE_OF_LIGHT times what the light on
+    the table takes of it, as far as tape and data sheets tell, but no more than the usual limit.
+    A camera that sees far beyond the light is asked for nothing out there."""
+    corners, camera = lit_area(config), factory_camera(config)
+    distance = config.camera.pose.position_m[2] - config.table.touched_height_m
+    area = np.linalg.norm(np.cross(corners[1] - corners[0], corners[3] - corners[0]))
+    light = area * camera.K[0, 0] * camera.K[1, 1] / (distance**2 * np.prod(camera.image_size))
+    return min(COVERAGE_OF_LIGHT * float(light), intrinsic.IntrinsicLimits.coverage)
 
 
 def conclude(record: Record[IntrinsicParams]) -> Result:
@@ -74,7 +90,7 @@ def conclude(record: Record[IntrinsicParams]) -> Result:
         result = solve(views)
     except SolveError as error:
         return Result.unsolved("intrinsic", error)
-    _, reasons = judge(result, record.params)
+    _, reasons = judge(result, record.params, record.config)
     return Result.judged(reasons, {"kind": "intrinsic", **views.merged(result.to_dict())})
 
 

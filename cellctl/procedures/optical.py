@@ -76,10 +76,10 @@ class Optical:
         )
         return stages.solve_stages(cell, intrinsic=self.camera, hand_eye=self.pose)
 
-    def judged(self, params: OpticalParams) -> dict[str, tuple[str, ...]]:
+    def judged(self, params: OpticalParams, config: CellConfig) -> dict[str, tuple[str, ...]]:
         """Why each part fails, by its name."""
         return {
-            INTRINSIC: intrinsic.judge(self.camera, params.intrinsic)[1],
+            INTRINSIC: intrinsic.judge(self.camera, params.intrinsic, config)[1],
             HAND_EYE: hand_eye.judge(self.pose, params.hand_eye)[1],
             PROJECTOR: projector.judge(self.light, self.shown, params.projector)[1],
         }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cellctl import ik
+from cellctl.calib.intrinsic import IntrinsicLimits
 from cellctl.config import parse_config
 from cellctl.geometry import pose_matrix
 from cellctl.motion import guard_of
@@ -87,3 +88,12 @@ def test_far_below_the_camera_boards_are_smaller_and_nearer_to_the_middle(config
     )
     assert (scaled.middle < 0.5) == (board == hand_eye.BOARD)
     assert not scaled.about_camera
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_sees_beyond_the_light_need_not_be_covered_there(seed):
+    """Twice what the light takes of the picture: 16 % in the large cell, by tape; in the small
+    one, which light fills by a quarter, the usual limit."""
+    small, large = (parse_config(cell_document(p, seed), "generated") for p in (CR, IR))
+    assert intrinsic.needed_coverage(small) == IntrinsicLimits.coverage
+    assert intrinsic.needed_coverage(large) == pytest.approx(0.16, abs=0.02)
